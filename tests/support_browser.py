@@ -21,6 +21,7 @@ import psutil
 import pytest
 from playwright.async_api import Browser, BrowserContext, ConsoleMessage, Locator, Page, Playwright, async_playwright
 
+from rr_actors.system import web_process
 from support import BROWSERS, LIMIT_S, REPOSITORY, eventually, wait_gone
 
 T = TypeVar("T")
@@ -141,8 +142,10 @@ class Tab:
         """Do something with `page`, and return when it is done."""
         return self._chromium.do(doing)
 
-    def goes_to(self, url: str) -> None:
-        self.do(self.page.goto(url))
+    def goes_to(self, url: str, path: str = "") -> None:
+        """Open the address that was printed, or another page of its server."""
+        address, _, token = url.partition("?")
+        self.do(self.page.goto(f"{address}{path}{'&' if '?' in path else '?'}{token}" if path else url))
         self.do(self.page.wait_for_url(lambda now: "token=" not in now))
 
     def clicks(self, name: str, role: Any = "button") -> None:
@@ -179,9 +182,9 @@ class Tab:
 
 @contextmanager
 def web(*arguments: object) -> Iterator[str]:
-    """The address of `rr-actors web` with these arguments, which runs in this block."""
+    """The address of `rr-actors web` with these arguments, which runs in this block, and begins as a system's page."""
     command = [sys.executable, "-m", "rr_actors", "web", *map(str, arguments)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program:
+    with web_process.subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program:
         assert program.stdout is not None
         try:
             yield program.stdout.readline().strip()

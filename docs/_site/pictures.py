@@ -13,6 +13,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 IMAGES = ROOT / "docs" / "images"
+OVERVIEW_S = 120
+"""How many seconds the first page's bars and curves show."""
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 import rr_actors as rr  # noqa: E402
@@ -81,14 +83,39 @@ def warn(system: rr.System) -> None:
     system.registrar("lenses").send_status(lens.id, rr.Status("WARNING", "dirty"))
 
 
+def kill_left(system: rr.System) -> None:
+    """Kill one of the two wheels, which are started again together."""
+    (left,) = [one for one in system.supervisor("root/drive").which_children() if one.id == "left"]
+    left.kill()
+
+
+def take_overview(tab: Tab) -> None:
+    """Take the picture of the first page after a kill, while a lens is in ERROR. It takes two minutes."""
+    with robot() as (system, app), system.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.sees("h1", "All is well")
+        for number in range(OVERVIEW_S):
+            if number == OVERVIEW_S // 2:
+                kill_left(system)
+            for _ in range(number % 7):
+                app.load("maps/map", "hall").unload()
+            tab.do(tab.page.wait_for_timeout(1000))
+        (lens,) = system.registrar("lenses").resources()
+        system.registrar("lenses").send_status(lens.id, rr.Status("ERROR", "no light"))
+        tab.sees("h1", "1 thing needs attention")
+        tab.sees(".rr-trouble", "no light", "touches")
+        tab.sees(".rr-five", "Deaths, last hour", "1 of left")
+        tab.do(tab.page.wait_for_timeout(2000))  # the numbers stand still
+        take(tab, "web-overview.png")
+
+
 def take_tree(tab: Tab) -> None:
     """Take the picture of the tree after a kill."""
     with robot() as (system, _), system.serve_web() as page:
-        tab.goes_to(page.url)
+        tab.goes_to(page.url, "tree")
         tab.do(tab.locate('[data-path="root/drive/left"]').click())
-        tab.sees(".rr-rows", "running, pid")
-        (left,) = [one for one in system.supervisor("root/drive").which_children() if one.id == "left"]
-        left.kill()
+        tab.sees(".rr-drawer", "running", "pid", "kill -9")
+        kill_left(system)
         tab.sees('[data-path="root/drive/left"]', "↻1", "running")
         tab.sees('[data-path="root/drive"]', "1/3")
         tab.sees(".rr-rows", "SIGKILL", "restarted")
@@ -103,7 +130,7 @@ def take_resources(tab: Tab) -> None:
         tab.clicks("Resources", role="link")
         tab.do(tab.locate('.ag-row:has-text("cameras/camera"):has-text("hall") .ag-cell').first.click())
         warn(system)
-        tab.sees(".rr-rows", "WARNING: dirty")
+        tab.sees(".rr-drawer", "dirty", "Who is touched", "began here")
         tab.sees(".ag-root", 'map "hall"', "WARNING")
         tab.do(tab.page.wait_for_timeout(4000))  # the status has passed
         take(tab, "web-resources.png")
@@ -155,6 +182,7 @@ def take_lab(tab: Tab) -> None:
         for _ in range(9):
             tab.clicks("step")
         tab.sees("[role=log]", "SIGKILL to b", "restarted     root/team/c")
+        tab.do(tab.page.wait_for_timeout(1000))  # the ripple of the click has passed
         take(tab, "web-lab.png")
 
 
@@ -164,8 +192,7 @@ def take_figures(tab: Tab) -> None:
     with tempfile.TemporaryDirectory() as state, rr.System(children, state_dir=state) as system:
         app = system.open_registrar("app")
         with system.serve_web() as page:
-            tab.goes_to(page.url)
-            tab.do(tab.page.goto(page.url.partition("?")[0] + "figures"))
+            tab.goes_to(page.url, "figures")
             for number in range(60):
                 app.load("cameras/camera", f"camera {number}")
                 tab.do(tab.page.wait_for_timeout(15 * number))
@@ -174,12 +201,13 @@ def take_figures(tab: Tab) -> None:
 
 
 TAKEN = (
+    (take_overview, 880),
     (take_tree, 640),
-    (take_resources, 900),
+    (take_resources, 940),
     (take_sequence, 800),
-    (take_loads, 560),
-    (take_figures, 640),
-    (take_lab, 1060),
+    (take_loads, 610),
+    (take_figures, 720),
+    (take_lab, 1140),
 )
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import math
 import os
 import subprocess
 import sys
@@ -15,12 +17,11 @@ import msgspec
 import typer
 from rich.cells import cell_len, set_cell_size
 
-from rr_actors.base.errors import NotRunning, RrError, UsageError
+from rr_actors.base.errors import NotRunning, RrError, UsageError, shown
 from rr_actors.tools.log_lines import printable
 
 _NARROWEST = 80  # columns of a table: a narrower terminal wraps its lines, as cut cells would show only dots
 _LEAST = 16  # columns that stay of the column that gives way
-_PIPED = 40  # columns to which it is padded where there is no terminal
 
 StateOption = Annotated[
     Path | None,
@@ -48,6 +49,23 @@ def shown_again(watch: bool, show: Callable[[], None]) -> None:
 
 
 # -- printing: what users write may contain any character, and controls no terminal ----------------------------------
+
+
+_UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0}
+
+
+def seconds_of(text: str, option: str, most_s: float = math.inf) -> float:
+    """Return the seconds of a duration that an option has: "90", "0.5s", "10m", "2h" or "1d".
+
+    Raises:
+        UsageError: it is none, or longer than `most_s`.
+    """
+    number, unit = (text[:-1], _UNITS[text[-1]]) if text[-1:] in _UNITS and text else (text, 1.0)
+    with contextlib.suppress(ValueError):
+        if 0 <= (seconds := float(number) * unit) <= most_s and math.isfinite(seconds):
+            return seconds
+    limit = "" if most_s == math.inf else f" of at most {most_s:g} s"
+    raise UsageError(f"{option}: expected a time{limit} (90s, 10m, 2h), got {shown(text)}")
 
 
 def say(text: str, *, err: bool = False) -> None:
@@ -106,6 +124,7 @@ def say_table(
     gives_way: Sequence[str],
     right: Sequence[str] = (),
     wide: bool = False,
+    styles: Sequence[str] = (),
 ) -> None:
     """Print a table as wide as the terminal, but at least 80 columns; without a terminal, as wide as needed.
 
@@ -114,24 +133,25 @@ def say_table(
             in this order.
         right: the heads of the columns of numbers.
         wide: shorten nothing; the terminal wraps the lines.
+        styles: Rich's words for the colour of each row, "red" or "dim" say. Without a terminal there are no colours.
     """
     cells = [[printable(cell) for cell in row] for row in (heads, *rows)]
     widths = [max(map(_width, column)) for column in zip(*cells, strict=True)]
     terminal = sys.stdout.isatty() and not wide
     room = max(os.get_terminal_size(sys.stdout.fileno()).columns, _NARROWEST) if terminal else 0
-    for yielding in map(heads.index, gives_way):
-        least = min(widths[yielding], _LEAST if terminal else _PIPED)
+    for yielding in map(heads.index, gives_way if terminal else ()):
         over = sum(widths) + 2 * (len(widths) - 1) - room
-        widths[yielding] = max(least, widths[yielding] - max(over, 0))
-        if terminal:
-            for row in cells:
-                row[yielding] = _shortened(row[yielding], widths[yielding])
+        widths[yielding] = max(min(widths[yielding], _LEAST), widths[yielding] - max(over, 0))
+        for row in cells:
+            row[yielding] = _shortened(row[yielding], widths[yielding])
     for number, row in enumerate(cells):
         line = "  ".join(
             f"{' ' * (width - _width(cell))}{cell}" if head in right else f"{cell}{' ' * (width - _width(cell))}"
             for head, cell, width in zip(heads, row, widths, strict=True)
         ).rstrip()
-        typer.echo(typer.style(line, bold=True) if number == 0 else line)
+        style = styles[number - 1] if number and styles else ""
+        colour = style if style and style != "dim" else None
+        typer.echo(typer.style(line, colour, bold=number == 0 or None, dim=style == "dim" or None))
 
 
 def _width(text: str) -> int:

@@ -19,6 +19,7 @@ import msgspec
 
 from rr_actors.base import __version__
 from rr_actors.base.config import SystemConfig
+from rr_actors.base.errors import counted
 from rr_actors.base.scarcity import group_limit
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.manager import Manager
@@ -90,7 +91,7 @@ def _descriptors() -> Iterator[Finding]:
     fits = max(0, (soft - _OWN_FDS) // _CHILD_FDS)
     yield _judge(
         "descriptors",
-        f"{soft} a process: {fits} children fit below one application",
+        f"{soft} a process: room for {counted(fits, 'child process')} below one application",
         limits=fits < _FEW_CHILDREN,
         lacks=fits < 2,
         todo="ulimit -n 65536 in the shell that starts the system, or LimitNOFILE=65536 in its systemd unit",
@@ -102,7 +103,7 @@ def _processes() -> Iterator[Finding]:
     fits = soft // _CHILD_THREADS
     yield _judge(
         "processes",
-        "no limit" if soft < 0 else f"{soft} of this user, threads included: {fits} children",
+        "no limit" if soft < 0 else f"{soft} of this user, threads included: room for {counted(fits, 'child process')}",
         limits=0 <= fits < _FEW_CHILDREN,
         todo="raise ulimit -u, or TasksMax= in the systemd unit",
     )

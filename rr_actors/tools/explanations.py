@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import math
-import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 
 from rr_actors.actors.messaging.mailbox_looks import COUNTED, ON_START, MailboxInfo
-from rr_actors.base.errors import NotFound, Unavailable, UnknownQuery, UsageError, few, shown
-from rr_actors.base.names import short_id, short_ids
+from rr_actors.base.errors import NotFound, Unavailable, UnknownQuery, UsageError, counted, few, shown
+from rr_actors.base.names import short_id, short_ids, time_in
 from rr_actors.registrar.model.failures import WAITS_FOR_SERVER
 from rr_actors.registrar.pages import HolderRow, QueryRow, ResourceRow
 from rr_actors.streams.stream import StreamRow
@@ -24,10 +23,8 @@ _MOST = 5  # things that one beginning of an id may name
 _WELL = ("OK", "UPDATE")
 _DEEP = 8  # resources above one another
 _BEFORE = 5  # events that came before a state
-_ID = re.compile(r"[0-9a-f]{12}[78][0-9a-f]{19}")
 _NAMES_KEPT = 10_000
 _names: dict[str, str] = {}  # of resources, by their ids
-_EARLIEST_S = 1_600_000_000.0  # an id that is no UUIDv7 gives another time
 
 
 def explain(client: ConsoleClient, id: str) -> list[str]:
@@ -55,7 +52,7 @@ def explain(client: ConsoleClient, id: str) -> list[str]:
     for waiting in line:
         holder = waiting.holders[0]
         said = f" ({waiting.message})" if waiting.message else ""
-        lines.append(f"{holder.origin} has waited for it{_since(holder.query_id)}{_priority(holder.priority)}{said}.")
+        lines.append(f"{holder.origin} {_waits('it', holder.query_id)}{_priority(holder.priority)}{said}.")
     return [*lines, *(f"Not asked: {note}" for note in found.notes)]
 
 
@@ -65,14 +62,6 @@ def _line_of(found: Found) -> list[ResourceRow]:
     if found.queries or len(line) == len(found.resources):  # the id names a load that waits
         return []
     return sorted(line, key=lambda row: (math.inf if row.priority is None else -row.priority, row.id))
-
-
-def since(id: str) -> float | None:
-    """Return when an id was made, in seconds since the epoch, if it is a UUIDv7; None for another kind of id."""
-    if _ID.match(id) is None:
-        return None
-    at = int(id[:12], 16) / 1000
-    return at if at > _EARLIEST_S else None
 
 
 def name_of_resource(ask: Callable[[Find], Found], id: str, registrar: str) -> str:
@@ -97,7 +86,7 @@ def seconds_text(seconds: float) -> str:
 
 
 def _since(id: str) -> str:
-    return _since_time(since(id))
+    return _since_time(time_in(id))
 
 
 def _since_time(at: float | None) -> str:
@@ -111,12 +100,17 @@ def _holds(what: str, query_id: str) -> str:
     return f"has held {what}{since}" if since else f"holds {what}"
 
 
+def _waits(what: str, query_id: str) -> str:
+    since = _since(query_id)
+    return f"has waited for {what}{since}" if since else f"waits for {what}"
+
+
 def _of_query(client: ConsoleClient, query: QueryRow) -> Iterator[str]:
     whose = name_of_resource(client.ask, query.parent, query.origin) if query.parent else "itself"
     said = f"Query {short_id(query.id)}: {query.origin}"
     match query.hold:
         case "pending":
-            yield f"{said} has waited for {query.name}{_since(query.id)}, for {whose}."
+            yield f"{said} {_waits(query.name, query.id)}, for {whose}."
         case "owed":
             yield f"{said} has released {query.name}, and {query.server} does not know it yet."
         case _:
@@ -141,7 +135,7 @@ def _of_resource(client: ConsoleClient, resource: ResourceRow) -> Iterator[str]:
     for holder in resource.holders:
         yield from _of_holder(client, holder, "", {resource.id})
     if resource.holder_count > len(resource.holders):
-        yield f"{resource.holder_count - len(resource.holders)} others hold it, too."
+        yield f"It has {counted(resource.holder_count - len(resource.holders), 'more holder')}."
     for stream in client.streams(resource.server.partition("/")[0], resource.id).rows:
         by = f"is read by {readers_text(stream)}" if stream.readers else "has no reader"
         yield f"Its stream {stream.info.name!r} {by}."
@@ -366,7 +360,7 @@ def _types(found: MailboxInfo) -> str:
 
 
 def _count(count: int) -> str:
-    return "no message waits" if not count else "1 message waits" if count == 1 else f"{count:,} messages wait"
+    return "no message waits" if not count else f"{counted(count, 'message')} {'waits' if count == 1 else 'wait'}"
 
 
 def _for(seconds: float | None) -> str:

@@ -22,6 +22,25 @@ LOOK_S = 0.5
 _Stamp = tuple[int, int]
 
 
+class SavedFile:
+    """A file that somebody edits. look() says when it has been saved."""
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        self._known = self._seen = _stamp(file)
+
+    def look(self) -> bool:
+        """Return whether the file has changed since this was last true, and is whole.
+
+        It is whole if it has not changed between two looks. A file that is not there has not changed.
+        """
+        before, self._seen = self._seen, _stamp(self._file)
+        if self._seen is None or self._seen == self._known or self._seen != before:
+            return False
+        self._known = self._seen
+        return True
+
+
 class ModuleWatcher:
     """Watches the modules of a system whose tree it is given. One thread may use it.
 
@@ -34,8 +53,7 @@ class ModuleWatcher:
         self._children: dict[Path, list[tuple[str, str]]] = {}
         self._forgotten: dict[str, ChildSpec] = {}  # temporary children that were stopped here and have not started yet
         self._collect(tree, tree.id)
-        self._loaded = {file: _stamp(file) for file in self._children}
-        self._seen = dict(self._loaded)
+        self._files = {file: SavedFile(file) for file in self._children}
 
     def _collect(self, supervisor: Supervisor, path: str) -> None:
         for spec in supervisor.child_specs:
@@ -51,11 +69,8 @@ class ModuleWatcher:
         """Restart the children whose modules have changed, and return their paths."""
         restarted: list[str] = []
         for file, children in self._children.items():
-            stamp, before = _stamp(file), self._seen[file]
-            self._seen[file] = stamp
-            if stamp is None or stamp == self._loaded[file] or stamp != before:  # the last: it is being written
+            if not self._files[file].look():
                 continue
-            self._loaded[file] = stamp
             try:
                 compile(file.read_bytes(), str(file), "exec")
             except (OSError, SyntaxError, ValueError) as error:

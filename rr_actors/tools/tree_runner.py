@@ -14,12 +14,14 @@ from typing import Any, cast
 from rr_actors.base.config import SystemConfig
 from rr_actors.base.errors import ConfigError, SupervisionError, did_you_mean, is_a, shown, text_of
 from rr_actors.base.reporting.log import Log
+from rr_actors.base.toml import read_toml, wrong
 from rr_actors.registrar.arguments import state_path
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor
 from rr_actors.system.system import System
 from rr_actors.tools.log_lines import begin_logging
 from rr_actors.tools.module_watcher import LOOK_S, ModuleWatcher
 from rr_actors.tools.tree_check import misordered
+from rr_actors.wire.name_service import HostSettings
 
 
 class _Told(BaseException):
@@ -52,9 +54,10 @@ def run_tree(
     begin_logging(log_level, as_json=log_json)
     state = state_path(state_dir).absolute()  # before the tree is read: that may change the directory
     settings = SystemConfig() if config is None else SystemConfig.from_toml(config)
+    hosts = read_hosts(tree, config)
     root = read_tree(tree)
     named = name or (root.id if root.id != _UNNAMED else "system")
-    system = System(root, name=named, state_dir=state, config=settings, debug=debug)
+    system = System(root, name=named, state_dir=state, config=settings, debug=debug, hosts=hosts)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, _told)
     try:
@@ -82,12 +85,34 @@ def verified(tree: str, config: Path | None) -> list[str]:
     """
     if config is not None:
         SystemConfig.from_toml(config)
+    read_hosts(tree, config)
     return misordered(read_tree(tree))
 
 
 _UNNAMED = "root"  # the id of a tree that gives none
 _OBJECT = "TREE"
 _EXPECTED = "a TOML file, FILE.py, FILE.py:OBJECT or MODULE:OBJECT"
+
+
+def read_hosts(tree: str, config: Path | None) -> HostSettings | None:
+    """Return what the table [hosts] says in the file of a tree, or in that of its configuration; None without one.
+
+    Raises:
+        ConfigError: both files have the table, or something in it is wrong. `.file`, `.key`, `.expected`, `.got`
+    """
+    places = [Path(tree).expanduser().absolute()] if _is_toml(tree) else []
+    places += [] if config is None else [config]
+    files = [str(file) for file in places if file.is_file() and "hosts" in read_toml(str(file))]
+    if len(files) > 1:
+        raise wrong(files[1], "hosts", f"one table [hosts], as {files[0]} has one", None, said="a second one")
+    if not files:
+        return None
+    settings = importlib.import_module("rr_actors.system.hosts.host_settings")  # what few systems need
+    return settings.Hosts.from_toml(files[0])
+
+
+def _is_toml(tree: str) -> bool:
+    return tree.endswith(".toml") or not (":" in tree or tree.endswith(".py"))
 
 
 def read_tree(tree: str) -> Supervisor:
@@ -104,7 +129,7 @@ def read_tree(tree: str) -> Supervisor:
         ConfigError: there is no such file or object, or it is no tree. `.file`, `.key`, `.expected`, `.got`
     """
     place, colon, name = tree.rpartition(":")
-    if tree.endswith(".toml") or (not colon and not tree.endswith(".py")):
+    if _is_toml(tree):
         file = Path(tree).expanduser().absolute()
         _look_in(Path.cwd())
         _look_in(file.parent)

@@ -143,7 +143,7 @@ def test_reading_leaves_no_file_behind(state: Path) -> None:
 def test_check_is_content_when_catalogs_agree(state: Path) -> None:
     checked = run("check", state)
 
-    assert (checked.returncode, checked.stdout) == (0, "2 catalogs, 1 queries: they agree\n")
+    assert (checked.returncode, checked.stdout) == (0, "2 catalogs, 1 query: no contradiction\n")
 
 
 def test_check_prints_each_violation_and_fails(state: Path) -> None:
@@ -230,6 +230,13 @@ def test_a_tree_of_nothing_is_told_in_words(tmp_path: Path) -> None:
     write(tmp_path, "cameras", resource("r1"), query("q1", "r1"))  # whose consumer's row was not written before a crash
 
     assert "nobody" not in run("tree", tmp_path).stdout
+
+
+@pytest.mark.parametrize("before", [(), ("check",), ("sequence",)], ids=" ".join)
+def test_h_is_short_for_help(before: tuple[str, ...]) -> None:
+    short, long = run(*before, "-h"), run(*before, "--help")
+    assert (short.returncode, short.stdout) == (0, long.stdout)
+    assert "Usage: rr-actors" in short.stdout
 
 
 def test_a_directory_without_catalogs_is_an_error_of_one_line(tmp_path: Path) -> None:

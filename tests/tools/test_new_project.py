@@ -16,6 +16,8 @@ from pathlib import Path
 
 import pytest
 
+from rr_actors.testing.experiments import Trial, check_levers, check_trials
+from rr_actors.tools.web.lab.lab_folder import read_experiment
 from support import REPOSITORY, eventually
 from support_cli import run_cli
 
@@ -95,6 +97,29 @@ def test_a_new_project_leaves_no_placeholder(project: Path) -> None:
     files = [path for path in project.rglob("*") if path.is_file()]
     assert len(files) == 9
     assert [path for path in files if re.search("_NAME_|_MODULE_", f"{path}{path.read_text()}")] == []
+
+
+@pytest.mark.timeout(240)
+def test_a_new_experiment_does_what_its_levers_say_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    ran = run_cli("new", "--experiment", "tea-break")
+    assert (ran.returncode, "rr-actors web --lab ." in ran.stdout) == (0, True), ran.stderr
+    made = tmp_path / "tea_break.py"
+    assert list(tmp_path.iterdir()) == [made]
+    assert re.search("_NAME_|_MODULE_", made.read_text()) is None
+    experiment = read_experiment(made)
+    assert (experiment.button, bool(experiment.look_for), bool(experiment.why)) == ("tea-break", True, True)
+    trials = [Trial(made, {}, {"yes"}), Trial(made, {"max_restarts": 1}, {"no: its supervisor has given up"})]
+    check_levers(trials)
+    check_trials(trials)
+
+
+def test_an_experiment_that_is_there_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tea_break.py").write_text("mine")
+    ran = run_cli("new", "--experiment", "tea-break")
+    assert (ran.returncode, ran.stderr) == (2, "rr-actors: tea_break.py: File exists\n")
+    assert (tmp_path / "tea_break.py").read_text() == "mine"
 
 
 @pytest.mark.parametrize(

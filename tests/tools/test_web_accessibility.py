@@ -16,7 +16,7 @@ from support_browser import LAB, Chromium, Tab, needs_chromium, web
 pytestmark = [needs_chromium, pytest.mark.timeout(180)]
 
 Start = Callable[..., rr.System]
-PAGES = ("", "timeline", "resources", "loads", "figures", "sequence")
+PAGES = ("", "tree", "timeline", "resources", "loads", "figures", "sequence")
 WIDTHS = (420, pytest.param(1400, marks=pytest.mark.slow), pytest.param(2560, marks=pytest.mark.slow))
 AXE = (resources.files("axe_playwright_python") / "axe.min.js").read_text()
 RUN = """async () => {
@@ -55,10 +55,10 @@ def test_axe_finds_no_violation_on_any_page_of_a_system(system: rr.System, tab: 
         found: dict[str, list[str]] = {}
         for path in PAGES:
             tab.do(tab.page.goto(page.url.partition("?")[0] + path))
-            tab.sees(".rr-status", "pid")
-            if not path:
+            tab.sees(".rr-main", "started")
+            if path == "tree":
                 tab.do(tab.locate('[data-path="root/a"]').click())
-                tab.sees(".rr-rows", "started")
+                tab.sees(".rr-drawer", "started")
             found[path] = violations(tab)
         assert [one for path in found for one in found[path]] == []
 
@@ -133,7 +133,19 @@ FAULTS = """(width) => {
     const name = (e) => `${e.className}: ${e.textContent.trim().slice(0, 40)}`;
     const cut = texts.filter((e) => e.scrollWidth > e.clientWidth + 1 && getComputedStyle(e).overflowX === "hidden"
         && e.clientWidth);
-    const boxes = texts.map((e) => [e, e.getBoundingClientRect()]).filter(([, b]) => b.width && b.height);
+    const seen = (e) => { // what of its box is not scrolled away
+        const box = e.getBoundingClientRect();
+        let [left, top, right, bottom] = [box.left, box.top, box.right, box.bottom];
+        for (let above = e.parentElement; above; above = above.parentElement) {
+            if (getComputedStyle(above).overflow === "visible") continue;
+            const pane = above.getBoundingClientRect();
+            [left, top] = [Math.max(left, pane.left), Math.max(top, pane.top)];
+            [right, bottom] = [Math.min(right, pane.right), Math.min(bottom, pane.bottom)];
+        }
+        return { left, top, right, bottom, width: right - left, height: bottom - top };
+    };
+    const boxes = texts.filter((e) => !e.closest("[inert]")).map((e) => [e, seen(e)])
+        .filter(([, b]) => b.width > 0 && b.height > 0);
     const lies = ([one, a], [other, b]) => !one.contains(other) && !other.contains(one)
         && Math.min(a.right, b.right) - Math.max(a.left, b.left) > 2
         && Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top) > 4;
@@ -164,7 +176,7 @@ def test_nothing_is_cut_off_or_covered_or_empty(system: rr.System, chromium: Chr
         found: list[str] = []
         for path in PAGES:
             tab.do(tab.page.goto(page.url.partition("?")[0] + path))
-            tab.sees(".rr-status", "pid")
+            tab.sees(".rr-main", "started")
             if path == "sequence":
                 tab.clicks("record")
                 tab.sees(".rr-note", "recording")
@@ -217,7 +229,7 @@ def test_no_name_in_the_graph_is_cut_off_or_covered_and_no_word_is_broken(
         tab.do(tab.page.goto(page.url.partition("?")[0] + "resources"))
         tab.waits(lambda: tab.do(tab.page.evaluate(NAMES))[0] > 25, "the names of the graph")
         tab.do(tab.locate('.ag-cell:has-text("usb-000")').first.click())
-        tab.sees(".rr-rows", "depends on 1", "lens")
+        tab.sees(".rr-drawer", "depends on 1", "lens")
         assert faults(tab, width) == []
         assert tab.do(tab.page.evaluate(NAMES))[1] == []
         assert tab.do(tab.page.evaluate(BROKEN)) == []

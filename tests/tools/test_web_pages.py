@@ -58,21 +58,20 @@ def node(path: str) -> str:
 
 def test_the_tree_shows_the_children_and_the_chosen_ones_history(shop: rr.System, tab: Tab) -> None:
     with shop.serve_web() as page:
-        tab.goes_to(page.url)
+        tab.goes_to(page.url, "tree")
         tab.sees(node("root"), "root", "one_for_one, 3 in 5 s", "0/3")
         tab.sees(node("root/shop"), "●", "running", str(pid_of(shop, "shop")))
-        tab.sees("body", "Choose a child to see its history.")
         tab.do(tab.locate(node("root/shop")).click())
-        tab.sees(".rr-rows", "running, pid", "started")
+        tab.sees(".rr-drawer", "running", "pid", "started")
         assert page.url.partition("token=")[2] not in tab.page.url
 
 
 def test_a_button_that_takes_something_away_has_the_colour_of_what_is_bad(shop: rr.System, tab: Tab) -> None:
     with shop.serve_web() as page:
-        tab.goes_to(page.url)
+        tab.goes_to(page.url, "tree")
         tab.do(tab.locate(node("root/shop")).click())
-        tab.sees(".rr-panel", "kill -9", "stop", "restart")
-        seen = "[...document.querySelectorAll('.rr-panel .q-btn')].filter((one) => one.offsetParent)"
+        tab.sees(".rr-drawer", "kill -9", "stop", "restart")
+        seen = "[...document.querySelectorAll('.rr-drawer .rr-act')].filter((one) => one.offsetParent)"
         script = f"{seen}.map((one) => getComputedStyle(one).color)"
         kill_9, stop, restart = tab.do(tab.page.evaluate(script))
         assert kill_9 == stop != restart
@@ -81,7 +80,7 @@ def test_a_button_that_takes_something_away_has_the_colour_of_what_is_bad(shop: 
 def test_a_child_is_killed_stopped_and_started_again_by_a_button_each(shop: rr.System, tab: Tab) -> None:
     pid = pid_of(shop, "shop")
     with shop.serve_web() as page:
-        tab.goes_to(page.url)
+        tab.goes_to(page.url, "tree")
         tab.do(tab.locate(node("root/shop")).click())
         tab.clicks("kill -9")
         tab.sees(".q-dialog", "Kill root/shop?")
@@ -109,7 +108,7 @@ def test_a_child_is_killed_stopped_and_started_again_by_a_button_each(shop: rr.S
 def test_a_child_that_fails_shows_its_traceback_and_what_it_logged(start: Start, tab: Tab) -> None:
     system = start(rr.ChildSpec(Fragile, id="fragile"))
     with system.serve_web() as page:
-        tab.goes_to(page.url)
+        tab.goes_to(page.url, "tree")
         tab.do(tab.locate(node("root/fragile")).click())
         system.ref("fragile").tell("break")
         tab.sees(node("root/fragile"), "↻1")
@@ -127,13 +126,13 @@ class Fragile(rr.Actor):
 def test_all_is_done_with_keys_alone(shop: rr.System, tab: Tab) -> None:
     pid = pid_of(shop, "shop")
     with shop.serve_web() as page:
-        tab.goes_to(page.url)
+        tab.goes_to(page.url, "tree")
         tab.sees(node("root/shop"), "running")
         focused = "document.activeElement.dataset.path || document.activeElement.innerText"
         while tab.do(tab.page.evaluate(focused)) != "root":
             tab.presses("Tab")
         tab.presses("ArrowDown", "Enter")
-        tab.sees(".rr-rows", "running, pid")
+        tab.sees(".rr-drawer", "running", "pid")
         while tab.do(tab.page.evaluate(focused)) != "kill -9":
             tab.presses("Tab")
         tab.presses("Enter")
@@ -148,13 +147,13 @@ def test_all_is_done_with_keys_alone(shop: rr.System, tab: Tab) -> None:
 @pytest.mark.slow
 def test_only_what_can_be_done_has_a_button_and_what_cannot_be_done_is_said(shop: rr.System, tab: Tab) -> None:
     def buttons() -> list[str]:
-        seen = "[...document.querySelectorAll('.rr-panel .q-btn')].filter((one) => one.offsetParent)"
+        seen = "[...document.querySelectorAll('.rr-drawer .rr-act')].filter((one) => one.offsetParent)"
         return tab.do(tab.page.evaluate(f"{seen}.map((one) => one.innerText)"))
 
     with shop.serve_web() as page:
-        tab.goes_to(page.url)
+        tab.goes_to(page.url, "tree")
         tab.do(tab.locate(node("root/shop")).click())
-        tab.sees(".rr-rows", "running, pid")
+        tab.sees(".rr-drawer", "running", "pid")
         assert buttons() == ["kill -9", "stop", "restart"]
         tab.clicks("kill -9")
         tab.sees(".q-dialog", "It cannot finish what it does.")
@@ -168,9 +167,9 @@ def test_only_what_can_be_done_has_a_button_and_what_cannot_be_done_is_said(shop
 @pytest.mark.slow
 def test_the_root_has_no_buttons_as_none_of_them_would_work(shop: rr.System, tab: Tab) -> None:
     with shop.serve_web() as page:
-        tab.goes_to(page.url)
+        tab.goes_to(page.url, "tree")
         tab.do(tab.locate(node("root/shop")).click())
-        tab.sees(".rr-rows", "running, pid")
+        tab.sees(".rr-drawer", "running", "pid")
         assert tab.do(tab.page.get_by_role("button", name="stop", exact=True).count()) == 1
         tab.do(tab.locate(node("root")).click())
         tab.waits(
@@ -183,7 +182,7 @@ def test_the_root_has_no_buttons_as_none_of_them_would_work(shop: rr.System, tab
 def test_two_browsers_see_the_same_and_what_the_other_does(shop: rr.System, tab: Tab, chromium: Chromium) -> None:
     with shop.serve_web() as page, chromium.tab() as other:
         for one in (tab, other):
-            one.goes_to(page.url)
+            one.goes_to(page.url, "tree")
             one.sees(node("root/shop"), "running")
         tab.do(tab.locate(node("root/shop")).click())
         tab.clicks("stop")
@@ -273,7 +272,7 @@ def test_a_chosen_resource_lights_up_with_its_holders_and_parts(camera: rr.Syste
         tab.clicks("Resources", role="link")
         sees_drawn(tab, 'camera \\"front\\"', 'lens \\"50 mm\\"', "@app")
         tab.do(tab.locate('.ag-cell:has-text("front")').first.click())
-        tab.sees(".rr-rows", 'provider/camera "front"', "held by 1", "depends on 1", 'provider/lens "50 mm"')
+        tab.sees(".rr-drawer", 'provider/camera "front"', "held by 1", "depends on 1", 'provider/lens "50 mm"')
         sees_drawn(
             tab,
             '["camera \\"front\\"",1,0]',
@@ -283,7 +282,7 @@ def test_a_chosen_resource_lights_up_with_its_holders_and_parts(camera: rr.Syste
         )
         (lens,) = [row for row in camera.registrar("provider").resources() if row.request == "50 mm"]
         camera.registrar("provider").send_status(lens.id, rr.Status("ERROR", "scratched"))
-        tab.sees(".rr-rows", "ERROR: scratched", "held, ERROR")  # so it comes from below
+        tab.sees(".rr-drawer", "ERROR", "scratched", "held, ERROR", "began here")  # so it comes from below
 
 
 def test_tree_and_counts_are_shown_before_the_libraries_of_graph_and_table_have_come(
@@ -304,7 +303,7 @@ def test_tree_and_counts_are_shown_before_the_libraries_of_graph_and_table_have_
         tab.goes_to(page.url)
         tab.do(tab.page.route("**/esm/**", hold))
         tab.do(tab.page.goto(page.url.partition("?")[0] + "resources"))
-        tab.sees(".rr-split", "3 resources", "one_for_one")
+        tab.sees(".rr-main", "3 resources")
         tab.waits(lambda: len(held) > 1, "both libraries are asked for")
         assert tab.do(tab.locate(".ag-row, canvas").count()) == 0
         tab.do(tab.page.get_by_label("search in id").fill("glass-less"))  # before there is a table
@@ -397,8 +396,7 @@ def test_a_status_is_seen_travelling_up(camera: rr.System, tab: Tab) -> None:
     provider = camera.registrar("provider")
     (lens,) = [row for row in provider.resources() if row.request == "50 mm"]
     with camera.serve_web() as page:
-        tab.goes_to(page.url)
-        tab.goes_to(page.url.partition("?")[0] + "resources")
+        tab.goes_to(page.url, "resources")
         sees_drawn(tab, "lens")
         keep_pictures(tab)
 
@@ -417,8 +415,7 @@ def test_a_status_is_seen_travelling_up(camera: rr.System, tab: Tab) -> None:
 def test_a_query_and_a_resource_are_unloaded_by_a_button_each(camera: rr.System, tab: Tab) -> None:
     app = camera.registrar("app")
     with camera.serve_web() as page:
-        tab.goes_to(page.url)
-        tab.goes_to(page.url.partition("?")[0] + "resources")
+        tab.goes_to(page.url, "resources")
         tab.do(tab.locate('.ag-cell:has-text("table")').first.click())
         tab.clicks("unload")
         tab.sees("body", "released query")
@@ -437,8 +434,7 @@ def test_a_query_and_a_resource_are_unloaded_by_a_button_each(camera: rr.System,
 def test_a_resource_is_revoked_by_a_button_after_a_question(camera: rr.System, tab: Tab) -> None:
     app = camera.registrar("app")
     with camera.serve_web() as page:
-        tab.goes_to(page.url)
-        tab.goes_to(page.url.partition("?")[0] + "resources")
+        tab.goes_to(page.url, "resources")
         tab.do(tab.locate('.ag-cell:has-text("table")').first.click())
         tab.sees(".rr-rows", "held by 1")
         tab.clicks("revoke")
@@ -493,13 +489,12 @@ def test_what_a_button_did_is_said_although_another_row_was_chosen_meanwhile(cam
     camera.registrar("provider").register_server("slow", lambda request: "made", unload, request_type=str)
     camera.registrar("app").load("provider/slow", "oven")
     with camera.serve_web() as page:
-        tab.goes_to(page.url)
-        tab.goes_to(page.url.partition("?")[0] + "resources")
+        tab.goes_to(page.url, "resources")
         tab.do(tab.locate('.ag-cell:has-text("oven")').first.click())
         tab.clicks("unload")
         tab.waits(begun.is_set, "its unload has begun")
         tab.do(tab.locate('.ag-cell:has-text("front")').first.click())
-        tab.sees(".rr-rows", 'provider/camera "front"')  # the button that was clicked is gone
+        tab.sees(".rr-drawer", 'provider/camera "front"')  # the button that was clicked is gone
         may_end.set()
         tab.sees("body", "released query", "oven")
 
@@ -507,8 +502,7 @@ def test_what_a_button_did_is_said_although_another_row_was_chosen_meanwhile(cam
 @pytest.mark.slow
 def test_the_table_is_searched_by_the_system_and_used_with_keys(camera: rr.System, tab: Tab) -> None:
     with camera.serve_web() as page:
-        tab.goes_to(page.url)
-        tab.goes_to(page.url.partition("?")[0] + "resources")
+        tab.goes_to(page.url, "resources")
         tab.sees(".ag-center-cols-container", "front", "table", "50 mm")
         tab.do(tab.locate("input[aria-label^=search]").click())
         tab.do(tab.page.keyboard.type("table"))
@@ -517,7 +511,7 @@ def test_the_table_is_searched_by_the_system_and_used_with_keys(camera: rr.Syste
         while tab.do(tab.page.evaluate("!document.activeElement.closest('.ag-center-cols-container')")):
             tab.presses("Tab", "ArrowDown")
         tab.presses("Space")
-        tab.sees(".rr-rows", 'provider/other "table"')
+        tab.sees(".rr-drawer", 'provider/other "table"')
 
 
 @pytest.mark.slow
@@ -525,8 +519,7 @@ def test_the_slider_shows_the_graph_as_it_was_whatever_happens_meanwhile(camera:
     app, provider = camera.registrar("app"), camera.registrar("provider")
     front, table, lens = (next(row for row in provider.resources() if row.request == what) for what in PARTS)
     with camera.serve_web() as page:
-        tab.goes_to(page.url)
-        tab.goes_to(page.url.partition("?")[0] + "resources")
+        tab.goes_to(page.url, "resources")
         sees_drawn(tab, '"camera \\"front\\"",1,0', '"other \\"table\\"",1,0', '"lens \\"50 mm\\"",1,0')
         before = titles(tab)
         app.unload(next(query for query in app.queries() if query.resource_id == table.id))
@@ -562,6 +555,7 @@ def program_of_page() -> psutil.Process:
 
 @pytest.mark.slow
 @pytest.mark.timeout(400)
+@pytest.mark.cold
 def test_the_table_stays_usable_with_100_000_resources(start: Start, tab: Tab) -> None:
     system = start()
     provider, app = system.open_registrar("provider"), system.open_registrar("app")
@@ -581,8 +575,7 @@ def test_the_table_stays_usable_with_100_000_resources(start: Start, tab: Tab) -
             with urllib.request.urlopen(request) as answer:
                 return json.loads(answer.read()), time.monotonic() - began
 
-        tab.goes_to(page.url)
-        tab.goes_to(page.url.partition("?")[0] + "resources")
+        tab.goes_to(page.url, "resources")
         sees_drawn(tab, f"thing {MANY:,}")
         tab.sees(cells, "provider/thing")
 
@@ -628,8 +621,7 @@ def test_from_300_resources_on_the_graph_shows_servers_opens_them_and_shows_one_
     (lens,) = [row for row in lenses.resources() if row.request == 77]
     lenses.send_status(lens.id, rr.Status("ERROR", "dark"))
     with system.serve_web() as page:
-        tab.goes_to(page.url)
-        tab.goes_to(page.url.partition("?")[0] + "resources")
+        tab.goes_to(page.url, "resources")
         sees_drawn(tab, "lens 151 1 ERROR", "camera 151 1 ERROR", "@app")
         tab.sees(".rr-note", "302 resources")
         tab.sees(".ag-center-cols-container", "cameras/camera")
@@ -638,7 +630,7 @@ def test_from_300_resources_on_the_graph_shows_servers_opens_them_and_shows_one_
         clicks_node(tab, lens.id, "lens 77", "camera 77", "@app")
         assert "camera 151" not in titles(tab)
         tab.sees(".rr-note", "those above and below it")
-        tab.sees(".rr-rows", "ERROR: dark")
+        tab.sees(".rr-drawer", "ERROR", "dark")
         lenses.send_status(lens.id, rr.Status("WARNING", "dim"))
         sees_drawn(tab, "! lens 77", "! camera 77")
         tab.clicks("all")
@@ -753,6 +745,7 @@ def test_a_program_that_prints_no_address_is_ended(
     assert time.monotonic() - began < 30
 
 
+@pytest.mark.cold
 def test_the_page_ends_with_its_system(start: Start, workshop: Workshop) -> None:
     system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
     page = system.serve_web()
@@ -763,6 +756,7 @@ def test_the_page_ends_with_its_system(start: Start, workshop: Workshop) -> None
     page.stop()
 
 
+@pytest.mark.cold
 def test_a_forked_child_that_leaves_the_block_of_a_page_closes_no_file_of_its_own(start: Start) -> None:
     with start().serve_web() as page:
         program = program_of_page()
@@ -807,7 +801,7 @@ def test_a_page_that_stays_open_shows_the_system_that_starts_again(
     children = [rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),))]
     system = start(*children)
     with web("--state", state_dir) as url:
-        tab.goes_to(url)
+        tab.goes_to(url, "tree")
         tab.sees(node("root/shop"), "running", str(pid_of(system, "shop")))
         system.stop()
         tab.sees(".rr-status", "waiting for it")
@@ -829,7 +823,7 @@ def test_the_slider_shows_the_tree_as_it_was_and_now_again(start: Start, worksho
     system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
     before = pid_of(system, "shop")
     with system.serve_web() as page:
-        tab.goes_to(page.url)
+        tab.goes_to(page.url, "tree")
         tab.sees(node("root/shop"), str(before))
         kill(system, "shop")
         tab.sees(node("root/shop"), "↻1", "running")
@@ -856,7 +850,7 @@ def test_a_mouse_moves_the_slider_and_the_page_says_that_it_shows_the_past(
     system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
     before = pid_of(system, "shop")
     with system.serve_web() as page:
-        tab.goes_to(page.url)
+        tab.goes_to(page.url, "tree")
         tab.do(tab.locate(node("root/shop")).click())
         tab.sees(node("root/shop"), str(before))
         kill(system, "shop")
@@ -1001,7 +995,7 @@ def test_a_page_is_never_a_second_behind_a_minute_of_a_thousand_events_a_second(
 def test_a_kill_is_shown_while_a_manager_answers_nothing(start: Start, tab: Tab) -> None:
     system = start(rr.ChildSpec(rr.Manager, id="still"), rr.ChildSpec(rr.Actor, id="actor"))
     with system.serve_web() as page:
-        tab.goes_to(page.url)
+        tab.goes_to(page.url, "tree")
         tab.sees(node("root/actor"), "running")
         still = pid_of(system, "still")
         hang(still)
@@ -1074,12 +1068,12 @@ CUT = """(() => {
 def test_no_page_is_wider_than_the_screen_and_no_child_is_cut_off(start: Start, chromium: Chromium, width: int) -> None:
     inner = rr.Supervisor([rr.ChildSpec(rr.Actor, id="somewhat-long-name")], id="inner")
     with start(rr.ChildSpec(rr.Actor, id="a"), inner).serve_web() as page, chromium.tab(width, 900) as tab:
-        tab.goes_to(page.url)
-        for path in ("", "timeline", "resources", "loads", "figures", "sequence"):
+        tab.goes_to(page.url, "tree")
+        for path in ("", "tree", "timeline", "resources", "loads", "figures", "sequence"):
             tab.do(tab.page.goto(page.url.partition("?")[0] + path))
-            tab.sees(".rr-status", "pid")
+            tab.sees(".rr-main", "started")
             assert tab.do(tab.page.evaluate("document.documentElement.scrollWidth")) <= width, path
-            if path in ("", "resources"):
+            if path == "tree":
                 tab.sees(node("root/inner/somewhat-long-name"), "running")
                 assert tab.do(tab.page.evaluate(CUT)) == []
 
@@ -1107,6 +1101,6 @@ def test_the_page_is_dark_where_the_system_is(shop: rr.System, tab: Tab) -> None
     })"""
     with shop.serve_web() as page:
         tab.do(tab.page.emulate_media(color_scheme="dark"))
-        tab.goes_to(page.url)
+        tab.goes_to(page.url, "tree")
         tab.sees(node("root/shop"), "running")
         assert max(tab.do(tab.page.evaluate(looks))) < 80

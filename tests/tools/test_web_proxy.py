@@ -130,17 +130,18 @@ def test_each_page_works_behind_a_proxy_with_a_path(start: Start, workshop: Work
     with shop.serve_web(port=proxy.to, prefix=PREFIX, hosts=hosts) as page, app.load("shop/thing", Order("tea")):
         assert page.url.startswith(f"http://localhost:{proxy.port}{PREFIX}/?token=")
         tab.goes_to(page.url)
-        tab.sees('[data-path="root/shop"]', "running", str(pid_of(shop, "shop")))  # by its websocket
+        tab.sees(".rr-main", "All is well", "shop")
         for name, place, shown in (
             ("Resources", ".ag-center-cols-container", "tea"),  # by its fetch
             ("Loads", "body", "shop/thing"),
             ("Figures", "body", "shop"),
             ("Timeline", "body", "shop"),
-            ("Tree", '[data-path="root/shop"]', "running"),
+            ("Tree", '[data-path="root/shop"]', f"{pid_of(shop, 'shop')}"),  # by its websocket
+            ("Overview", ".rr-main", "All is well"),
         ):
             tab.clicks(name, "link")
             tab.sees(place, shown)
-            path = "/" if name == "Tree" else f"/{name.lower()}"
+            path = "/" if name == "Overview" else f"/{name.lower()}"
             assert urlsplit(tab.page.url).path == PREFIX + path
     assert proxy.strayed == []
     assert {urlsplit(url).netloc for url in tab.asked if url.startswith("http")} == {f"localhost:{proxy.port}"}

@@ -43,6 +43,7 @@ from rr_actors.registrar.arguments import (
 )
 from rr_actors.registrar.declarations import Declared, declaring
 from rr_actors.registrar.load_groups import GroupWays, LoadWanted, Queries, note_request
+from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.pages import QueryRow
 from rr_actors.registrar.queries import Holder, Query, StatusCallback, loaded_directly, read_as, was_given
 from rr_actors.registrar.registrar import Consumer
@@ -271,7 +272,8 @@ class _ClientLoads(RemoteLoads):
             # If the connection ends before keep(), the system releases the query.
             with client.views.loading(), client.connections.lent(min(GREETING_S, limit_s + GRACE_S)) as connection:
                 held = connection.ask(command, left_until(deadline))
-                place = held.query_id, target, request, "", client.name, self.holder, _shown_types, client.all_streams
+                server = parse_server_id(held.server) if held.server else target
+                place = held.query_id, server, request, "", client.name, self.holder, _shown_types, client.all_streams
                 query = ClientQuery(place, bytes(request), options)
                 if options.codec is not None:
                     read_as(query, options.codec)
@@ -425,15 +427,15 @@ class ClientRegistrar(Consumer):
             raise Unavailable(f"{self.name}: its queries are not known: {'; '.join(found.notes)}")
         return found.rows
 
-    def fetch_state(self, query_or_id: Query | str) -> str:
-        """Ask the system for the state of the last status of a query: "OK", "WARNING" ...
+    def fetch_state(self, query_or_id: Query | str) -> State:
+        """Ask the system for the state of the last status of a query.
 
         Raises:
             UnknownQuery: the query is not held any more.
             NotRunning: the system has ended.
             Unavailable: the registrar does not answer.
         """
-        return self._row(target_id(query_or_id)).state
+        return State(self._row(target_id(query_or_id)).state)
 
     def fetch_priority(self, query_or_id: Query | str) -> int | None:
         """Ask the system for the priority of a query; None: on standby.

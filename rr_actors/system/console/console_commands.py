@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -19,13 +20,14 @@ from rr_actors.base.errors import (
     Unavailable,
     UnknownQuery,
     UsageError,
+    counted,
     few,
     shown,
 )
 from rr_actors.base.names import CLIENTS, check_name, parse_server_id, short_id, short_ids
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.base.values.failure import error_of
-from rr_actors.registrar.arguments import LoadOptions
+from rr_actors.registrar.arguments import LoadOptions, server_target
 from rr_actors.registrar.model.failures import held_by_whole
 from rr_actors.registrar.model.rows import HIGHEST, LOWEST
 from rr_actors.registrar.pages import QueryRow, ResourceRow
@@ -33,12 +35,14 @@ from rr_actors.registrar.queries import Status, response_bytes
 from rr_actors.registrar.registrar import load_bytes
 from rr_actors.runtime.processes.lifeline import signal_if
 from rr_actors.runtime.processes.process import signal_name
+from rr_actors.supervision.core.foreseen import What
 from rr_actors.supervision.core.specs import Supervisor, child_from_toml
 from rr_actors.supervision.supervisor import Child, SupervisorRef
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.asking import actor_calls
 from rr_actors.system.console.client_registrars import Caller
 from rr_actors.system.console.console_view import REGISTRAR, Command, Verb, View
+from rr_actors.system.snapshots import preview_in
 
 # -- resources -------------------------------------------------------------------------------------------------------
 
@@ -260,7 +264,7 @@ def _only_resource(id: str, resources: list[ResourceRow]) -> ResourceRow:
 
 
 def _count(resource: ResourceRow) -> str:
-    return f"{resource.holder_count} holder{'' if resource.holder_count == 1 else 's'}"
+    return counted(resource.holder_count, "holder")
 
 
 def _json(text: str) -> Any:
@@ -302,7 +306,10 @@ class Kill(Command[c.Done], frozen=True):
         restart = supervisor.get_childspec(child.id).restart
         facts = {"path": path, "pid": child.pid, "signal": name, "restart": restart}
         if self.dry_run:
-            return c.Done(f"would send {name} to {path} (pid {child.pid})", facts)
+            text = f"would send {name} to {path} (pid {child.pid})"
+            if self.signal != signal.SIGKILL:
+                return c.Done(text, facts)
+            return _foretold(view, text, facts, path, "kill")
         try:
             sent = signal_if(child.pid, self.signal, lambda: supervisor.which_child(child.id).pid == child.pid)
         except OSError as error:
@@ -322,7 +329,7 @@ class Terminate(Command[c.Done], frozen=True):
         path, supervisor, child = _child(view, self.child)
         facts = {"path": path, "was": child.state}
         if self.dry_run:
-            return c.Done(f"would stop {path}, which is {child.state}", facts)
+            return _foretold(view, f"would stop {path}, which is {child.state}", facts, path, "stop")
         supervisor.terminate_child(child.id)
         return c.Done(f"stopped {path}" if child.state != "stopped" else f"{path} was stopped already", facts)
 
@@ -347,11 +354,30 @@ class Restart(Command[c.Done], frozen=True):
             raise UsageError(f"{path}: its supervisor forgets it when it stops; terminate it, and start a new one")
         facts = {"path": path, "was": child.state}
         if self.dry_run:
-            return c.Done(f"would start {path} again, which is {child.state}", facts)
+            return _foretold(view, f"would start {path} again, which is {child.state}", facts, path, "restart")
         if child.state != "stopped":
             supervisor.terminate_child(child.id)
         supervisor.restart_child(child.id)
         return c.Done(f"started {path} again", facts | {"pid": supervisor.which_child(child.id).pid})
+
+
+def _foretold(view: View, text: str, facts: dict[str, Any], path: str, what: What) -> c.Done:
+    """Say what would happen to the tree and the resources."""
+    preview = preview_in(view.node, view.system.supervisor().path, path, what)
+    texts = [text, *preview.sentences()]
+    if (took := _last_start_s(view, path)) is not None:
+        texts.append(f"its last start took {took:.2g} s")
+    resources, heard = preview.resources[: c.PAGE_LIMIT], preview.heard[: c.PAGE_LIMIT]  # an answer has a limit
+    left_out = len(preview.resources) - len(resources), len(preview.heard) - len(heard)
+    shown_part = msgspec.structs.replace(preview, resources=resources, heard=heard)
+    would = msgspec.to_builtins(shown_part) | dict(zip(("resources_left_out", "heard_left_out"), left_out, strict=True))
+    return c.Done("; ".join(texts), facts | {"would": would})
+
+
+def _last_start_s(view: View, path: str) -> float | None:
+    """Return how many seconds the newest start of a child took; None if that is not remembered."""
+    starts = [event for event in view.history(path) if event.path == path and event.event in ("started", "restarted")]
+    return starts[-1].facts.get("ready_s") if starts else None
 
 
 def _resources_of(view: View, id: str) -> list[ResourceRow]:
@@ -507,14 +533,16 @@ class Hold(Command[c.Holding], frozen=True):
         client = view.clients.named(self.registrar)
         registrar = client.registrar
         options = LoadOptions(on_status=client.hear, priority=self.priority, own=True, wait_s=self.wait_s)
-        query = load_bytes(registrar, self.server, self.request, "", options, timeout_s=self.timeout_s)
+        target = server_target(self.server, view.node)
+        query = load_bytes(registrar, str(target), self.request, "", options, timeout_s=self.timeout_s)
         response = response_bytes(query)
         if len(response) > c.RESPONSE_LIMIT_BYTES:
             registrar.unload(query.id, timeout_s=self.timeout_s)
             text = f"a response of {len(response)} bytes is over a client's limit of {c.RESPONSE_LIMIT_BYTES}"
             raise NotSerializable(f"{self.server}: {text}; give the name of a file, say", path="response")
         client.watch(query, view.node)
-        return c.Holding(query.id, query.resource_id, response, query.state)
+        there = str(target) if "/" in target.registrar else ""
+        return c.Holding(query.id, query.resource_id, response, query.state, there)
 
 
 class Release(Command[c.Done], frozen=True):

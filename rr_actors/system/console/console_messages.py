@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import msgspec
 
+from rr_actors.actors.actor_tables import TableColumn
 from rr_actors.actors.messaging.dead_letters import DeadLetter
 from rr_actors.actors.messaging.mailbox_looks import MailboxInfo
 from rr_actors.base.names import named
@@ -23,6 +24,7 @@ from rr_actors.registrar.pages import LoadRow, QueryRow, ResourceRow, ServerRow
 from rr_actors.streams.stream import StreamRow
 from rr_actors.system.recording.event_memory import Event
 from rr_actors.system.recording.figures import Figure
+from rr_actors.wire.name_service import HostInfo
 
 VERSION = 7
 SOCKET = "console.sock"
@@ -183,6 +185,13 @@ class Servers(Message, frozen=True):
     notes: list[str] = []
 
 
+class HostRows(Message, frozen=True):
+    """The other hosts. `host`: the system's own name among them."""
+
+    host: str
+    rows: list[HostInfo]
+
+
 class Response(Message, frozen=True):
     """The whole response of a resource, as JSON; "" if there is no such resource, or its load has not returned."""
 
@@ -212,11 +221,12 @@ class UsageRow(msgspec.Struct, frozen=True, omit_defaults=True):
     request: str
     usage: dict[str, float] = {}
     failure: str = ""
+    title: str = ""
 
     @property
     def name(self) -> str:
-        """Its server and its request, shortened for people."""
-        return named(self.server, self.request)
+        """Its server and its request or title, shortened for people."""
+        return named(self.server, self.title or self.request)
 
 
 class Usages(Message, frozen=True):
@@ -311,12 +321,16 @@ class Done(Message, frozen=True):
 
 
 class Holding(Message, frozen=True):
-    """The answer to Hold: the query that the client's registrar holds now, and the response's canonical bytes."""
+    """The answer to Hold: the query that the client's registrar holds now, and the response's canonical bytes.
+
+    server: the id of the server if that is of another host, say behind a route; "": it is the one that was asked for.
+    """
 
     query_id: str
     resource_id: str
     response: bytes
     state: State = State.OK
+    server: str = ""
 
 
 class Heard(msgspec.Struct, frozen=True, omit_defaults=True, tag=True):
@@ -413,3 +427,27 @@ class Missed(Message, frozen=True):
     count: int
     seq: int
     tree: Children
+
+
+class ShownTable(msgspec.Struct, frozen=True):
+    """A table that the actor at a path declares."""
+
+    actor: str
+    name: str
+    columns: tuple[TableColumn, ...]
+
+
+class TableRow(msgspec.Struct, frozen=True):
+    """A row of the table of this number in the answer: its fields, plain data, as canonical bytes."""
+
+    table: int
+    facts: bytes
+
+
+class TablePage(Message, frozen=True):
+    """The answer to ListTables. `notes`: which actors could not be asked, and why."""
+
+    total: int
+    tables: list[ShownTable] = []
+    rows: list[TableRow] = []
+    notes: list[str] = []

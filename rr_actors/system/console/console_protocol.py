@@ -9,7 +9,8 @@ import msgspec
 
 from rr_actors.system.console import console_commands, console_questions
 from rr_actors.system.console import console_messages as c
-from rr_actors.system.console.asking import actor_calls
+from rr_actors.system.console.asking import actor_calls, table_questions
+from rr_actors.system.console.attention import attention_questions
 from rr_actors.system.console.console_view import Verb
 
 _A = TypeVar("_A")
@@ -35,6 +36,8 @@ _DECLARED: list[Any] = [
     *vars(console_questions).values(),
     *vars(console_commands).values(),
     *vars(actor_calls).values(),
+    *vars(attention_questions).values(),
+    *vars(table_questions).values(),
 ]
 _VERBS: list[type[Verb[c.Message]]] = [one for one in _DECLARED if isinstance(one, type) and _is_verb(one)]
 REQUESTS = (c.Hello, c.Follow, c.BeginRecording, c.Keep, *_VERBS)

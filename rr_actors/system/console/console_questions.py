@@ -9,8 +9,8 @@ import msgspec
 
 from rr_actors.actors.mailbox_refs import MailboxRef
 from rr_actors.base.errors import NotSerializable, UsageError, shown
-from rr_actors.registrar.declarations import Declaring
-from rr_actors.registrar.pages import LOAD_ORDERS, RESOURCE_ORDERS, STREAM_ORDERS, Page, Wanted, What
+from rr_actors.registrar.declarations import DeclaringClass
+from rr_actors.registrar.pages import LOAD_ORDERS, RESOURCE_ORDERS, STREAM_ORDERS, RowPage, Wanted, What
 from rr_actors.registrar.registrar import has_all_streams
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.asking import actor_calls
@@ -40,7 +40,7 @@ class ListRows(Listing[_A], frozen=True):
     sort: c.Text = ""
     orders: ClassVar[Collection[str]] = ()
 
-    def _page(self, view: View, what: What, **more: Any) -> tuple[Page, list[str]]:
+    def _page(self, view: View, what: What, **more: Any) -> tuple[RowPage, list[str]]:
         if self.sort and self.sort not in self.orders:
             raise UsageError(f"sort: expected one of {', '.join(self.orders) or 'none'}, got {shown(self.sort)}")
         wanted = Wanted(what, self.match, self.offset, self.limit, self.sort, **more)
@@ -87,6 +87,15 @@ class ListServers(Look[c.Servers], frozen=True):
         return c.Servers(found.total, found.servers[: c.SERVERS_LIMIT], notes)
 
 
+class ListHosts(Look[c.HostRows], frozen=True):
+    """The other hosts that the system knows."""
+
+    def _carry_out(self, view: View, caller: Caller) -> c.HostRows:
+        if (hosts := view.node.info.hosts) is None:
+            raise UsageError(f"system {view.node.info.name!r}: expected one with hosts=, it ends at this host")
+        return c.HostRows(hosts.host, hosts.known(view.node.directory))
+
+
 class ListLoads(ListRows[c.Loads], frozen=True):
     """A page of the loads that wait, of one registrar or of all, and how often and how long those of its servers did.
 
@@ -99,8 +108,9 @@ class ListLoads(ListRows[c.Loads], frozen=True):
     def _carry_out(self, view: View, caller: Caller) -> c.Loads:
         found, notes = self._page(view, "loads")
         said = found.said
-        providers = dict.fromkeys(row.server.partition("/")[0] for row in found.queries if self.registrar)
-        for reported in ask_each(list(providers), view.load_reports):
+        providers = dict.fromkeys(row.server.rpartition("/")[0] for row in found.queries if self.registrar)
+        providers = [name for name in providers if "/" not in name]  # what another host's says stays there
+        for reported in ask_each(providers, view.load_reports):
             said |= reported
         rows = [msgspec.structs.replace(row, said=said.get(row.id, "")) for row in found.queries]
         servers = sorted(found.loads, key=LOAD_ORDERS[self.sort], reverse=True) if self.sort else found.loads
@@ -116,7 +126,7 @@ class ListUsages(ListRows[c.Usages], frozen=True):
         found, notes = self._page(view, "resources")
         usages, failures = view.usages([(row.server.partition("/")[0], row.id) for row in found.resources], notes)
         rows = [
-            c.UsageRow(row.id, row.server, row.request, usages.get(row.id, {}), failures.get(row.id, ""))
+            c.UsageRow(row.id, row.server, row.request, usages.get(row.id, {}), failures.get(row.id, ""), row.title)
             for row in found.resources
         ]
         return c.Usages(found.total, rows[: room_for(rows, notes)], notes)
@@ -158,7 +168,7 @@ class FindServer(Verb[c.ServerFound], frozen=True):
     server: c.Text
 
     def _carry_out(self, view: View, caller: Caller) -> c.ServerFound:
-        return c.ServerFound(Declaring(self.owner, self.method, self.server).id_in(view.node.directory))
+        return c.ServerFound(DeclaringClass(self.owner, self.method, self.server).id_in(view.node.directory))
 
 
 class HasAllStreams(Verb[c.AllStreams], frozen=True):

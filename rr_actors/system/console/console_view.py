@@ -29,12 +29,13 @@ from rr_actors.base.errors import ActorUnavailable, NotFound, RrError, Unavailab
 from rr_actors.base.names import child_meant, no_child
 from rr_actors.hosting.forwarded_logs import KeptLogs
 from rr_actors.registrar.engine.node import Node
-from rr_actors.registrar.pages import Page, ResourceRow, Wanted
+from rr_actors.registrar.pages import QueryRow, ResourceRow, RowPage, Wanted
 from rr_actors.registrar.registrar import Registrar, Usages, page
 from rr_actors.runtime.processes.lifeline import stopped
 from rr_actors.streams.stream import StreamRow
 from rr_actors.supervision.supervisor import SupervisorRef
 from rr_actors.system.console import console_messages as c
+from rr_actors.system.console.attention.attention_items import Silences
 from rr_actors.system.console.client_registrars import Caller, ClientRegistrars
 from rr_actors.system.recording.event_memory import Event, EventMemory, events_below, events_of
 from rr_actors.system.recording.figures import Figure
@@ -47,6 +48,7 @@ _LOOK_S = 5.0
 _USAGE_S = 2.0
 _HISTORY = 2000  # events of children
 _ALIKE = 20  # queries of one name
+_TITLES = 10_000
 REGISTRAR = "console"
 """The registrar of the system that holds the resources that a console loads and keeps. The first such load opens it."""
 _A = TypeVar("_A")
@@ -95,6 +97,7 @@ class View:
 
     Attributes:
         clients: the registrars of clients.
+        silences: what is not to be shown of what needs attention.
     """
 
     def __init__(
@@ -106,7 +109,9 @@ class View:
         self.child_logs = child_logs
         self.shut_down = shut_down
         self.clients = ClientRegistrars()
+        self.silences = Silences()
         self._opening = threading.Lock()
+        self._titles: dict[str, str] = {}  # of the requests of queries, by the ids of these
         self.since = time.time()
         self._began = time.monotonic()
 
@@ -249,7 +254,7 @@ class View:
         except RrError as error:
             return c.RegistrarRow(name, status.value, error=readable(text_of(error)))
 
-    def page(self, wanted: Wanted, registrar: str = "") -> tuple[Page, list[str]]:
+    def page(self, wanted: Wanted, registrar: str = "") -> tuple[RowPage, list[str]]:
         """Return a page over one registrar or all that are up, and notes on registrars that do not answer.
 
         All are asked at once how many rows they have, and then those with rows in the page for these.
@@ -257,15 +262,32 @@ class View:
         names = self.up(registrar)
         if len(names) == 1:
             pages, notes = self._pages({names[0]: wanted})
-            return _joined(list(pages.values())), notes
+            return self._titled(_joined(list(pages.values()))), notes
         pages, notes = self._pages(dict.fromkeys(names, msgspec.structs.replace(wanted, offset=0, limit=0)))
         rows, more = self._pages(_parts(pages, wanted))
-        return _joined(list((pages | rows).values())), notes + more
+        return self._titled(_joined(list((pages | rows).values()))), notes + more
 
-    def _pages(self, wanted: Mapping[str, Wanted]) -> tuple[dict[str, Page], list[str]]:
+    def _titled(self, page: RowPage) -> RowPage:
+        """Return a page with the titles of its queries. Their providers are asked for them, once for each query."""
+        unknown: dict[str, list[str]] = {}
+        for row in page.queries:
+            if row.id not in self._titles:
+                unknown.setdefault(row.server.partition("/")[0], []).append(row.id)
+        up = self.node.statuses() if unknown else {}
+        asked = {name: Wanted("titles", ids=tuple(ids)) for name, ids in unknown.items() if up.get(name) is Presence.UP}
+        for found in self._pages(asked)[0].values() if asked else ():
+            self._titles |= found.titles
+        while len(self._titles) > _TITLES:
+            del self._titles[next(iter(self._titles))]
+        if not any(self._titles.get(row.id) for row in page.queries):
+            return page
+        rows = [msgspec.structs.replace(row, title=self._titles.get(row.id, "")) for row in page.queries]
+        return msgspec.structs.replace(page, queries=rows)
+
+    def _pages(self, wanted: Mapping[str, Wanted]) -> tuple[dict[str, RowPage], list[str]]:
         """Return a page of each registrar that answers, in the order of `wanted`, and notes on the others."""
 
-        def ask(name: str) -> Page | RrError:
+        def ask(name: str) -> RowPage | RrError:
             try:
                 return page(self.registrar(name), wanted[name])
             except RrError as error:
@@ -317,7 +339,7 @@ class View:
         if space and "/" in server:
             part = request.partition("…")[0]
             found, notes = self.page(Wanted("resources", part, limit=c.PAGE_LIMIT), server.partition("/")[0])
-            rows = [row for row in found.resources if id in (row.name, f"{row.server} {row.request}")]
+            rows = [row for row in found.resources if id in _names(row)]
             return c.Found(rows or self._as_its_holder_names_it(id, part), [], notes)
         found, notes = self.page(Wanted("id", id), registrar)
         resources, queries = found.resources, found.queries
@@ -329,14 +351,19 @@ class View:
     def _as_its_holder_names_it(self, name: str, part: str) -> list[ResourceRow]:
         """Return the resource of this name at its holders: they have 60 in a request that its server reads as 60.0."""
         queries = self.page(Wanted("queries", part, limit=c.PAGE_LIMIT))[0].queries
-        named = [row for row in queries if name in (row.name, f"{row.server} {row.request}")]
+        named = [row for row in queries if name in _names(row)]
         found = ask_each(
             named[:_ALIKE], lambda row: self.page(Wanted("id", row.id), row.server.partition("/")[0])[0].resources
         )
         return list({row.id: row for rows in found for row in rows}.values())
 
 
-def _parts(pages: Mapping[str, Page], wanted: Wanted) -> dict[str, Wanted]:
+def _names(row: ResourceRow | QueryRow) -> set[str]:
+    """Return all names of a resource: shortened for people, whole, and with its request in the place of its title."""
+    return {row.name, f"{row.server} {row.text}", f"{row.server} {row.request}"}
+
+
+def _parts(pages: Mapping[str, RowPage], wanted: Wanted) -> dict[str, Wanted]:
     """Return which rows of a page each registrar has, given how many rows it has in all, and of which keys."""
     runs = [(key, name, count) for name, found in pages.items() for key, count in found.counts or [(0.0, found.total)]]
     runs.sort(key=lambda run: run[0], reverse=True)  # those of one key stay in the order of the registrars
@@ -352,14 +379,14 @@ def _parts(pages: Mapping[str, Page], wanted: Wanted) -> dict[str, Wanted]:
     return parts
 
 
-def _joined(pages: Sequence[Page]) -> Page:
+def _joined(pages: Sequence[RowPage]) -> RowPage:
     """Return the rows of several registrars as one page, in the order of their keys."""
 
-    def rows(of: Callable[[Page], Sequence[_A]]) -> list[_A]:
+    def rows(of: Callable[[RowPage], Sequence[_A]]) -> list[_A]:
         found = [one for page in pages for one in zip(page.keys or itertools.repeat(0.0), of(page), strict=False)]
         return [row for _, row in sorted(found, key=lambda one: one[0], reverse=True)]
 
-    return Page(
+    return RowPage(
         sum(found.total for found in pages),
         rows(lambda found: found.resources),
         [row for found in pages for row in found.queries],
@@ -409,7 +436,9 @@ def _rows(node: Mapping[str, Any], depth: int = 0) -> Iterator[c.ChildRow]:
         yield from _rows(child, depth + 1)
 
 
-def room_for(rows: Sequence[ResourceRow | c.UsageRow | StreamRow | Event], notes: Sequence[str] = ()) -> int:
+def room_for(
+    rows: Sequence[ResourceRow | c.UsageRow | StreamRow | Event | c.TableRow], notes: Sequence[str] = ()
+) -> int:
     """Return how many of these rows, from the first on, have room in an answer with the notes: texts may be long."""
     limit = c.RESPONSE_LIMIT_BYTES - len(msgspec.msgpack.encode(notes))
     sizes = itertools.accumulate(len(msgspec.msgpack.encode(row)) for row in rows)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from rr_actors.base.errors import counted
 from rr_actors.registrar.pages import ServerRow
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
@@ -172,7 +173,7 @@ def _parts(child: c.ChildRow, registrar: c.RegistrarRow, servers: Sequence[Serve
 def _doing(server: ServerRow) -> str:
     """Return what a server does now, for people."""
     count = sum(server.states.values())
-    resources = f"{count} resource{'' if count == 1 else 's'}" if count else ""
+    resources = counted(count, "resource") if count else ""
     runs = ", ".join(f"{count} {role}" for role, count in sorted(server.runs.items()))
     waiting = f"{server.waiting} wait" if server.waiting else ""
     return "; ".join(filter(None, (f"runs {runs}" if runs else "", waiting, resources)))
@@ -189,7 +190,7 @@ def _child(of: Figures, has_columns: bool) -> Row:
 
 def _registrar(of: Figures, has_columns: bool) -> Row:
     row = of.registrar or _NO_REGISTRAR
-    note = row.status if row.status != "up" else f"{len(row.servers)} server{'' if len(row.servers) == 1 else 's'}"
+    note = row.status if row.status != "up" else counted(len(row.servers), "server")
     if unheard := of.counts.get("unheard"):
         note = f"{unheard} unheard"
     return Row(

@@ -7,9 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from rr_actors.base.errors import counted
+from rr_actors.base.names import time_in
 from rr_actors.registrar.pages import LoadRow, QueryRow
 from rr_actors.system.console import console_questions as questions
-from rr_actors.tools.explanations import name_of_resource, seconds_text, since
+from rr_actors.tools.explanations import name_of_resource, seconds_text
 from rr_actors.tools.tables.table import Asks, Column, Look, Row, Rows, Table
 
 _NONE_WAITS = "No load waits now."
@@ -29,7 +31,7 @@ def _waiting(asks: Asks, look: Look) -> Rows[Waiting]:
     rows: list[Waiting] = []
     for row in found.rows:
         whose = name_of_resource(asks.ask, row.parent, row.origin) if row.parent else "itself"
-        at = since(row.id)
+        at = time_in(row.id)
         rows.append(Waiting(row, whose, "" if at is None else seconds_text(max(0.0, time.time() - at))))
     return Rows(found.total, rows, found.notes)
 
@@ -66,7 +68,7 @@ WAITING = Table[Waiting](
     _waiting,
     _waiting_line,
     nothing=_NONE_WAITS,
-    caption=lambda total: f"{total:,} load{'' if total == 1 else 's'} in progress" if total else _NONE_WAITS,
+    caption=lambda total: f"{counted(total, 'load')} in progress" if total else _NONE_WAITS,
     facts=lambda of: of.row,
 )
 SERVERS = Table[LoadRow](
@@ -81,12 +83,17 @@ SERVERS = Table[LoadRow](
         _time("mean", lambda row: row.mean_s),
         _time("p95", lambda row: row.p95_s),
         _time("longest", lambda row: row.longest_s),
+        _time("own mean", lambda row: row.own_mean_s),
+        _time("own p95", lambda row: row.own_p95_s),
     ),
     _servers,
     lambda row, has_columns: Row(
-        f"loads {row.server}", row.server, "" if has_columns or not row.longest_s else f"p95 {seconds_text(row.p95_s)}"
+        f"loads {row.server}",
+        row.server,
+        "" if has_columns or not row.longest_s else f"p95 {seconds_text(row.p95_s)}",
+        "red" if row.failed else "",
     ),
-    narrow=("mean", "p95", "loads", "shared", "waited", "failed", "longest"),
+    narrow=("mean", "p95", "loads", "shared", "waited", "failed", "longest", "own mean", "own p95"),
     caption=lambda total: "Loads of each server",
     page_sort="waiting now",
 )

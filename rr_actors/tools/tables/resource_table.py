@@ -18,14 +18,19 @@ def _source(asks: Asks, look: Look) -> Part[ResourceRow]:
     )
 
 
+def shown_name(row: ResourceRow | UsageRow) -> str:
+    """Return a resource's name for people, whole: with its title, if it has one."""
+    return f"{row.server} {row.title or row.request}"
+
+
 def full_name(row: ResourceRow | UsageRow) -> str:
     """Return a resource's name with the whole request that is known."""
     return f"{row.server} {row.request}"
 
 
 def _state(row: ResourceRow) -> str:
-    """Return the state; of a resource that is not loaded, with what is known of its load, say."""
-    return row.condition if row.phase == "loaded" else f"{row.condition} {row.message}".rstrip()
+    """Return the state; unless all is well, with the message: of the last status, or how far the load has come."""
+    return row.condition if row.condition == "OK" else f"{row.condition} {row.message}".rstrip()
 
 
 def _line(row: ResourceRow, has_columns: bool) -> Row:
@@ -38,7 +43,7 @@ def _line(row: ResourceRow, has_columns: bool) -> Row:
 RESOURCES = Table[ResourceRow](
     "resources",
     (
-        Column("resource", full_name, sorts=True, gives_way=True, views="verb"),
+        Column("resource", shown_name, sorts=True, gives_way=True, views="verb"),
         Column("resource", lambda row: row.name, sorts=True, views="page"),
         Column("state", _state, sorts=True, gives_way=True, views="verb"),
         Column("state", lambda row: row.condition, 11, sorts=True, views="top page"),

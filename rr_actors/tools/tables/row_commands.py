@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import msgspec
+
 from rr_actors.base.names import short_id
 from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
@@ -42,6 +44,10 @@ class RowCommand:
         """Return what it does to the thing of a row: "kill root/shop"."""
         thing = row.child.path if row.child else row.name or short_id(row.resource or row.query)
         return self.phrase.format(thing)
+
+    def dry_run(self, row: Row) -> Command[c.Done]:
+        """Return the command that changes nothing, and says what would happen."""
+        return msgspec.structs.replace(self.command(row), dry_run=True)
 
 
 def _child(obstacle: Callable[[c.ChildRow], str]) -> Obstacle:

@@ -63,6 +63,12 @@ def _loads() -> ModuleType:
     return load_tables
 
 
+def _plans() -> ModuleType:
+    from rr_actors.tools.tables import plan_table
+
+    return plan_table
+
+
 SHEETS = (
     Sheet(
         "children", "ps",
@@ -88,10 +94,22 @@ SHEETS = (
 
         A load is shared if it joins a resource that is loaded, or is being loaded. It has waited if it was not answered
         at once. The times are those of load callbacks: the mean and the longest of all, p95 of the newest 500.
+        Their own times are without those in which they waited for the loads of their parts.
         """,
         "loads cameras --sort-by p95 --watch", "Only those with this text in their id, server or request.", "5", _loads,
         title="loads: those that wait, and each server's",
         note="Since each server was registered. Shared: joined a resource that was loaded, or was being loaded. "
-        "Waited: not answered at once. Mean, p95 (of the newest 500) and longest are the times of load callbacks.",
+        "Waited: not answered at once. Mean, p95 (of the newest 500) and longest are the times of load callbacks. "
+        "Own mean and own p95 are without the time in which they waited for their parts.",
+    ),
+    Sheet(
+        "plans", "plans",
+        """Show what managers plan: the tables that they declare, such as pools, what is kept, choices and graphs.
+
+        A manager of your own declares one with @rr.table. Each row says what its manager knows now.
+        """,
+        "plans pools --watch", "Only those with this text in the row, the table's name or the manager's path.",
+        "6", _plans, options=(),
+        note="The tables that managers declare: pools, what is kept, choices, graphs of actions, and your own.",
     ),
 )  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from rr_actors.base.errors import counted
 from rr_actors.base.names import named
 from rr_actors.streams.stream import StreamRow
 from rr_actors.system.console import console_questions as questions
@@ -24,7 +25,7 @@ def stream_facts(row: StreamRow) -> dict[str, Any]:
 
 
 def _line(row: StreamRow, has_columns: bool) -> Row:
-    info, of = row.info, named(row.info.server, row.request)
+    info, of = row.info, named(row.info.server, row.title or row.request)
     note = "" if has_columns else rate_text(row)
     return Row(info.id, f"{info.name}  {of}", note, resource=info.resource_id, name=of)
 
@@ -33,7 +34,7 @@ STREAMS = Table[StreamRow](
     "streams",
     (
         Column("stream", lambda row: row.info.name),
-        Column("resource", lambda row: f"{row.info.server} {row.request}", gives_way=True),
+        Column("resource", lambda row: f"{row.info.server} {row.title or row.request}", gives_way=True),
         Column("rate", rate_text, sorts=True, right=True),
         Column("bytes", bytes_text, 13, sorts=True, right=True),
         Column("age", age_text, right=True),
@@ -47,7 +48,7 @@ STREAMS = Table[StreamRow](
     _line,
     narrow=("rate", "bytes", "readers", "missed", "age", "read by"),
     nothing="no stream is open",
-    caption=lambda total: f"{total:,} open stream{'' if total == 1 else 's'}" if total else "No stream is open.",
+    caption=lambda total: counted(total, "open stream") if total else "No stream is open.",
     named=lambda row: f"{row.info.server} {row.request}",
     facts=stream_facts,
 )

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from rr_actors.base.errors import NotRunning, UsageError, shown
+from rr_actors.base.errors import NotRunning, UsageError, counted, shown
 from rr_actors.system.backups import WRITING_S, back_up_files
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_commands import BackUp
@@ -75,4 +75,4 @@ def restore(
     if as_json:
         say_json({"state": str(state), "system": backup.system, "at": backup.at, "catalogs": len(backup.registrars)})
     else:
-        say(f"{state} has {len(backup.registrars)} catalogs of system {backup.system} again; start it there")
+        say(f"{state} has {counted(len(backup.registrars), 'catalog')} of system {backup.system} again; start it there")

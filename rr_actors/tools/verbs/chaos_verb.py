@@ -9,6 +9,7 @@ from typing import Annotated
 import msgspec
 import typer
 
+from rr_actors.base.errors import counted
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.tools.cli_commands import JsonOption, StateOption, say, say_json, say_lines, say_table
 from rr_actors.tools.random_kills import KillPlan, KillReport, RandomKills
@@ -73,7 +74,7 @@ def _say_plan(run: RandomKills, plan: KillPlan, as_json: bool) -> None:
     if as_json:
         say_json({"kills": plan.kills, "seed": plan.seed, "children": victims, "left_alone": run.report.left_alone})
         return
-    say(f"would send SIGKILL {plan.kills} times, each time to one of these at random (seed {plan.seed}):")
+    say(f"would send SIGKILL {counted(plan.kills, 'time')}, each time to one of these at random (seed {plan.seed}):")
     say_lines("\n".join(victims), "  ")
     _say_left_alone(run.report)
 
@@ -101,4 +102,5 @@ def _say_report(report: KillReport) -> None:
     elif report.interrupted:
         say("interrupted: what follows the last kill was not checked")
     else:
-        say(f"each child runs again; {report.catalogs} catalogs, {report.queries} queries: they agree")
+        catalogs, queries = counted(report.catalogs, "catalog"), counted(report.queries, "query")
+        say(f"each child runs again; {catalogs}, {queries}: no contradiction")

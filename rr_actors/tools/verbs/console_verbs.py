@@ -13,7 +13,7 @@ import msgspec
 import typer
 
 from rr_actors.base.checks import needing
-from rr_actors.base.errors import NotRunning, UsageError, shown
+from rr_actors.base.errors import NotRunning, UsageError, counted, shown
 from rr_actors.base.values.canonical import Codec
 from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
@@ -134,7 +134,7 @@ def _remembered(state: Path | None, question: questions.ListEvents | questions.L
         say(f"no system runs in {state}: this is what it has left", err=True)
         return events[-question.limit :]
     if found.left_out:
-        say(f"{found.left_out} older events are not shown: they are too long for one answer", err=True)
+        say(f"not shown: {counted(found.left_out, 'older event')}, too long for one answer", err=True)
     return found.events
 
 
@@ -175,7 +175,7 @@ def stack(
         return
     left_out = f", {found.stacks.left_out} of them left out" if found.stacks.left_out else ""
     count = len(found.stacks.threads) + found.stacks.left_out
-    say(f"{found.path}: process {found.stacks.pid}, {count} threads{left_out}")
+    say(f"{found.path}: process {found.stacks.pid}, {counted(count, 'thread')}{left_out}")
     for one in found.stacks.threads:
         say(f"{one.thread}:")
         for frame in one.frames:

@@ -7,6 +7,7 @@ import inspect
 import json
 import math
 import sys
+import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -19,8 +20,11 @@ from rr_actors.actors.messaging.dead_letters import DeadLetters
 from rr_actors.base.errors import UsageError, shown
 from rr_actors.base.names import short_ids
 from rr_actors.registrar.pages import CONDITIONS
-from rr_actors.system.console.console_messages import PAGE_LIMIT, UsageRow
-from rr_actors.system.console.console_questions import ListDeadLetters
+from rr_actors.system.console.attention.attention_items import AttentionItem, counts_text
+from rr_actors.system.console.attention.attention_questions import Attention, ListAttention, Silence
+from rr_actors.system.console.console_messages import PAGE_LIMIT, TIMEOUT_LIMIT_S, UsageRow
+from rr_actors.system.console.console_questions import ListDeadLetters, ListHosts
+from rr_actors.system.recording.event_texts import ago, clock
 from rr_actors.tools.cli_commands import (
     JsonOption,
     StateOption,
@@ -29,11 +33,23 @@ from rr_actors.tools.cli_commands import (
     say_json,
     say_lines,
     say_table,
+    seconds_of,
     shown_again,
 )
+from rr_actors.tools.tables.resource_table import full_name, shown_name
 from rr_actors.tools.tables.sheets import Sheet
 from rr_actors.tools.tables.table import Column, Look, Table, tables_of
-from rr_actors.tools.verbs.console_options import SHOWN, Limit, Output, RowLimit, client_of, completing, list_registrars
+from rr_actors.tools.verbs.console_options import (
+    SHOWN,
+    Limit,
+    Output,
+    RowLimit,
+    carry_out,
+    client_of,
+    completing,
+    list_registrars,
+)
+from rr_actors.wire.name_service import HostInfo
 
 app = typer.Typer()
 
@@ -128,7 +144,8 @@ def _show(tables: Sequence[Table[Any]], look: Look, limit: int | None, form: str
         elif part.rows:
             if table is not tables[0]:
                 say("")
-            say_rows(table.shown_in("verb"), part.rows, form)
+            styles = [table.line(row, True).style for row in part.rows]
+            say_rows(table.shown_in("verb"), part.rows, form, styles)
         elif table.nothing:
             chosen = (look.match or look.registrar or look.states or look.holder) and len(tables) == 1
             say(f"no {table.name[:-1]} matches" if chosen else table.nothing, err=len(tables) == 1)
@@ -145,8 +162,8 @@ def _nested(row: object) -> Any:
     return found
 
 
-def say_rows(columns: Sequence[Column[Any]], rows: Sequence[Any], form: str = "") -> None:
-    """Print rows as a table; with the form "wide", nothing is shortened."""
+def say_rows(columns: Sequence[Column[Any]], rows: Sequence[Any], form: str = "", styles: Sequence[str] = ()) -> None:
+    """Print rows as a table, each in its style; with the form "wide", nothing is shortened."""
     texts: list[list[str]] = []
     for column in columns:
         cells = [column.text(row) for row in rows]
@@ -155,7 +172,9 @@ def say_rows(columns: Sequence[Column[Any]], rows: Sequence[Any], form: str = ""
     gives_way = [column.head for column in columns if column.gives_way]
     right = [column.head for column in columns if column.right]
     heads = [column.head for column in columns]
-    say_table(heads, list(zip(*texts, strict=True)), gives_way=gives_way, right=right, wide=form == "wide")
+    say_table(
+        heads, list(zip(*texts, strict=True)), gives_way=gives_way, right=right, wide=form == "wide", styles=styles
+    )
 
 
 def _most(limit: int | None, form: str) -> int:
@@ -203,22 +222,18 @@ def _show_usages(state: Path | None, match: str, registrar: str, sort_by: str, l
     if form == "json":
         say_json([_nested(msgspec.structs.asdict(row)) for row in rows])
     elif form == "name":
-        say_lines("\n".join(map(_full_name, rows)))
+        say_lines("\n".join(map(full_name, rows)))
     elif not rows:
         say("no resource says what it uses", err=True)
     else:
         numbers = [Column(name.removesuffix("_bytes"), partial(_amount, name), right=True) for name in names]
-        name, id = Column[UsageRow]("resource", _full_name, gives_way=True), Column[UsageRow]("id", _id, is_id=True)
+        name, id = Column[UsageRow]("resource", shown_name, gives_way=True), Column[UsageRow]("id", _id, is_id=True)
         say_rows([name, *numbers, id], [row for row in rows if row.usage], form)
         ids = short_ids(row.id for row in rows)
         for row in rows:
             if row.failure:
                 say(f"not known: {row.name} ({ids[row.id]}): {row.failure}", err=True)
     _say_what_is_missing(total - len(rows), page.notes)
-
-
-def _full_name(row: UsageRow) -> str:
-    return f"{row.server} {row.request}"
 
 
 def _id(row: UsageRow) -> str:
@@ -232,6 +247,58 @@ def _amount(name: str, row: UsageRow) -> str:
     return f"{number / 2**20:.0f} MiB" if name.endswith("_bytes") else f"{number:.6g}"
 
 
+@app.command(epilog="Example: rr-actors attention --silence pool:root/budgets:watts --for 30m")
+def attention(
+    silence: Annotated[
+        str, typer.Option("--silence", metavar="ITEM", help="Do not show this item for a while: its id, or a part.")
+    ] = "",
+    for_: Annotated[
+        str, typer.Option("--for", metavar="TIME", help="How long: 90s, 10m, 2h; 0 shows it again.")
+    ] = "1h",
+    watch: WatchOption = False,
+    state: StateOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show what needs attention, the worst first: what, since when, whom it touches, and the command that leads on.
+
+    The exit code is 1 if there is something, and 0 if all is well. What is silenced does not count; it is listed with
+    its time. The system's process keeps what is silenced until it ends.
+    """
+    if silence:
+        carry_out(state, Silence(silence, seconds_of(for_, "--for", TIMEOUT_LIMIT_S)), as_json)
+        return
+    found = list[AttentionItem]()
+
+    def show() -> None:
+        with client_of(state) as client:
+            answer = client.ask(ListAttention())
+        found[:] = answer.items
+        _say_attention(answer, as_json)
+
+    shown_again(watch, show)
+    if found:
+        raise typer.Exit(1)
+
+
+def _say_attention(answer: Attention, as_json: bool) -> None:
+    if as_json:
+        say_json(answer)
+        return
+    say(counts_text(answer.items, answer.silenced))
+    for item in answer.items:
+        say("")
+        since = "" if item.since is None else f"  since {clock(item.since)} ({ago(max(0.0, time.time() - item.since))})"
+        say(f"{item.severity:<7}  {item.what}")
+        if item.touches:
+            more = item.touched - len(item.touches)
+            say(f"         touches {', '.join(item.touches)}{f' and {more} more' if more > 0 else ''}")
+        leads = f"rr-actors {item.command}" if item.command else ""
+        say(f"         {'  '.join(filter(None, (leads, item.id)))}{since}")
+    for id, until in answer.silenced.items():
+        say(f"silenced until {clock(until)}: {id}")
+    _say_what_is_missing(answer.total - len(answer.items), answer.notes)
+
+
 @app.command("dead-letters", epilog="Example: rr-actors dead-letters --limit 5")
 def dead_letters(limit: Limit = 20, state: StateOption = None, as_json: JsonOption = False) -> None:
     """Show how many messages could not be delivered, and the newest of them."""
@@ -241,3 +308,23 @@ def dead_letters(limit: Limit = 20, state: StateOption = None, as_json: JsonOpti
         say_json({"count": letters.count, "letters": letters.letters})
     else:
         say_lines(str(DeadLetters(letters.count, letters.letters)))
+
+
+@app.command("hosts", epilog="Example: rr-actors hosts")
+def hosts(state: StateOption = None, as_json: JsonOption = False) -> None:
+    """Show the other hosts that the system knows: whether each is reachable, since when, and what it exports."""
+    with client_of(state) as client:
+        found = client.ask(ListHosts())
+    if as_json:
+        say_json({"host": found.host, "hosts": found.rows})
+    elif not found.rows:
+        say(f"host {found.host}: no other host has been seen, and the settings name none")
+    else:
+        now = time.time()
+        say_lines("\n".join(_host_line(row, now) for row in found.rows))
+
+
+def _host_line(row: HostInfo, now: float) -> str:
+    exports = ", ".join(f"{name} ({status})" for name, status in row.exports.items()) or "nothing"
+    why = f" ({row.why})" if row.why else ""
+    return f"{row.name}  {row.state} for {now - row.since:.0f} s{why}; exports {exports}"

@@ -9,7 +9,7 @@ from typing import Annotated, Any, cast
 
 import typer
 
-from rr_actors.base.errors import UnknownQuery, UsageError, did_you_mean, shown
+from rr_actors.base.errors import UnknownQuery, UsageError, counted, did_you_mean, shown
 from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.asking.waiting import (
@@ -192,7 +192,7 @@ def _child_lines(row: c.ChildRow, facts: dict[str, Any], served: list[c.Registra
     yield f"{row.path}: {row.state}{f', {row.error}' if row.error else ''}"
     if row.pid is not None:
         up = "" if row.up_s is None else f", up for {ago(row.up_s)}"
-        yield f"    process {row.pid}{up}, {row.restarts} restart{'' if row.restarts == 1 else 's'}"
+        yield f"    process {row.pid}{up}, {counted(row.restarts, 'restart')}"
     if facts["memory_bytes"] is not None:
         yield f"    {facts['cpu_percent']:.1f} % of a core, {facts['memory_bytes'] / 2**20:.0f} MiB"
     for text in filter(None, (row.strategy, row.note)):

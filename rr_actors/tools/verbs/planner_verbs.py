@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import pwd
+import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,8 +17,11 @@ from rr_actors.base.toml import read_bytes
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_commands import AskActor
-from rr_actors.tools.cli_commands import JsonOption, StateOption, say, say_json, say_lines, say_table
+from rr_actors.tools.cli_commands import JsonOption, StateOption, say, say_json, say_lines
+from rr_actors.tools.tables.plan_table import PLANS, columns_of, source
+from rr_actors.tools.tables.table import Look
 from rr_actors.tools.verbs.console_options import DryRun
+from rr_actors.tools.verbs.list_verbs import say_rows
 
 app = typer.Typer()
 _ANSWER_S = 60.0
@@ -32,6 +37,19 @@ def _asked(state: Path | None, planner: str, message: dict[str, Any]) -> Any:
     command = AskActor(planner, encode(message, f"message to {planner}"), _ANSWER_S)
     with ConsoleClient(find_console(state), timeout_s=_ANSWER_S + 10) as client:
         return _LOOSE.show(client.ask(command).answer)
+
+
+def _say_table(state: Path | None, planner: str, name: str, none: str, as_json: bool) -> None:
+    """Print the table of this name that a child declares."""
+    table = replace(PLANS, source=source(name, planner, _ANSWER_S))
+    with ConsoleClient(find_console(state), timeout_s=_ANSWER_S + 10) as client:
+        rows = table.read(client, Look(), sys.maxsize).rows
+    if as_json:
+        say_json([row.facts for row in rows])
+    elif rows:
+        say_rows(columns_of(rows[0]), rows, styles=[table.line(row, True).style for row in rows])
+    else:
+        say(none, err=True)
 
 
 def _question(name: str, file: Path) -> dict[str, str | None]:
@@ -82,33 +100,12 @@ def keep(
     if what == "get":
         if file is not None:
             raise UsageError("keep get: expected no file, got one; rr-actors apply FILE gives a Keeper another")
-        _say_kept(_asked(state, keeper, {"get": None}), as_json)
+        _say_table(state, keeper, "kept", "nothing is kept", as_json)
         return
     lines: list[str] = _asked(state, keeper, {"diff": None} if file is None else _question("diff", file))
     _say_changes(lines, "all is as it is wanted" if file is None else "no change", as_json)
     if lines:
         raise typer.Exit(1)
-
-
-def _say_kept(rows: list[dict[str, Any]], as_json: bool) -> None:
-    if as_json:
-        say_json(rows)
-    elif rows:
-        cells = [
-            (
-                row["name"],
-                f"{row['ready']} of {row['wanted']}",
-                "" if row["least"] is None else f"{row['least']}-{row['most']}",
-                row["scaled"],
-                row["why"],
-                row["detail"],
-            )
-            for row in rows
-        ]
-        heads = ("kept", "ready", "range", "scaled", "why", "")
-        say_table(heads, cells, gives_way=("", "scaled"), right=("ready",))
-    else:
-        say("nothing is kept", err=True)
 
 
 @app.command(epilog="Example: rr-actors budgets")
@@ -120,24 +117,7 @@ def budgets(
     as_json: JsonOption = False,
 ) -> None:
     """Show the pools of a Budgets: how much each has, what is used and free, and how many loads wait for room."""
-    rows: list[dict[str, Any]] = _asked(state, child, {"pools": None})
-    if as_json:
-        say_json(rows)
-        return
-    cells = [
-        (
-            row["name"],
-            f"{row['capacity']:g}",
-            f"{row['used']:g}",
-            f"{row['free']:g}",
-            str(row["waiting"]),
-            "yes" if row["enforced"] else "no",
-            row["problem"],
-        )
-        for row in rows
-    ]
-    heads = ("pool", "capacity", "used", "free", "waiting", "enforced", "problem")
-    say_table(heads, cells, gives_way=("problem",), right=("capacity", "used", "free", "waiting"))
+    _say_table(state, child, "pools", "there are no pools", as_json)
 
 
 def _me() -> str:
@@ -150,18 +130,7 @@ def _me() -> str:
 @app.command(epilog="Example: rr-actors choices")
 def choices(child: ChoicesOption = "choices", state: StateOption = None, as_json: JsonOption = False) -> None:
     """Show the choices of a Choices: which alternative each has, and what was chosen by hand, by whom."""
-    rows: list[dict[str, Any]] = _asked(state, child, {"choices": None})
-    if as_json:
-        say_json(rows)
-    elif rows:
-        cells = [
-            (short_id(row["id"]), row["kind"], row["present"], row["by_hand"], row["by"], row["why"]) for row in rows
-        ]
-        say_table(
-            ("id", "kind", "in use", "by hand", "by", "why not"), cells, gives_way=("in use", "by hand", "why not")
-        )
-    else:
-        say("there are no choices", err=True)
+    _say_table(state, child, "choices", "there are no choices", as_json)
 
 
 @app.command(epilog="Example: rr-actors choose range lidars/lidar")

@@ -24,7 +24,7 @@ def version() -> None:
     typer.echo(__version__)
 
 
-_TEMPLATES = Path(__file__).parents[1] / "new_project"
+_TOOLS = Path(__file__).parents[1]
 
 
 @app.command(epilog="Example: rr-actors new robot")
@@ -32,6 +32,9 @@ def new(
     name: Annotated[
         str, typer.Argument(metavar="NAME", help="The project's: lower-case letters, digits and single hyphens.")
     ],
+    experiment: Annotated[
+        bool, typer.Option("--experiment", help="Make NAME.py instead: an experiment for rr-actors web --lab DIR.")
+    ] = False,
 ) -> None:
     """Make a small project: two managers, an application, a test that kills one, a systemd unit, a Dockerfile."""
     module = name.replace("-", "_")
@@ -39,16 +42,26 @@ def new(
         raise UsageError(f"NAME: expected lower-case letters, digits and single hyphens, got {shown(name)}")
     if keyword.iskeyword(module) or importlib.util.find_spec(module) is not None:
         raise UsageError(f"NAME: expected no word of Python and no name of an installed module, got {shown(name)}")
+    if experiment:
+        _copy(_TOOLS / "new_experiment", Path(), name, module)
+        typer.echo(f"made {module}.py: change it, and see it with: rr-actors web --lab .")
+        return
     Path(name).mkdir()
-    for template in sorted(_TEMPLATES.rglob("*.txt")):
+    _copy(_TOOLS / "new_project", Path(name), name, module)
+    typer.echo(f"made {name}: see {name}/README.md, or: cd {name}; pip install -e '.[test]'; python -m pytest")
+
+
+def _copy(templates: Path, place: Path, name: str, module: str) -> None:
+    """Write each file of a folder of templates below a directory. None of them may be there."""
+    for template in sorted(templates.rglob("*.txt")):
         path, text = (
             text.replace("_NAME_", name).replace("_MODULE_", module)
-            for text in (str(template.relative_to(_TEMPLATES)), template.read_text())
+            for text in (str(template.relative_to(templates)), template.read_text())
         )
-        target = Path(name, path.removesuffix(".txt"))
+        target = place / path.removesuffix(".txt")
         target.parent.mkdir(exist_ok=True)
-        target.write_text(text)
-    typer.echo(f"made {name}: see {name}/README.md, or: cd {name}; pip install -e '.[test]'; python -m pytest")
+        with target.open("x") as file:
+            file.write(text)
 
 
 @app.command(epilog="Example: rr-actors import-temoto components.yaml pipes.yaml > pipes.toml")

@@ -10,13 +10,14 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
 import msgspec
 import typer
 
-from rr_actors.base.errors import NotFound, NotRunning, UsageError, did_you_mean, few, shown, text_of
+from rr_actors.base.errors import NotFound, NotRunning, RrError, UsageError, counted, did_you_mean, few, shown, text_of
 from rr_actors.base.names import short_id
 from rr_actors.base.values.canonical import encode
 from rr_actors.hosting.forwarded_logs import LogLine
@@ -24,14 +25,23 @@ from rr_actors.registrar.model.recorded import Entry
 from rr_actors.streams.stream import Stream, StreamFrame, StreamRow
 from rr_actors.streams.stream_file import StreamHeader, StreamWriter
 from rr_actors.system.console import console_messages as c
-from rr_actors.system.console.console_client import ConsoleClient, find_console
-from rr_actors.system.console.console_questions import Find, ReadResponse
-from rr_actors.system.recording.recordings import Recording, RecordingFile, add, read_recording
+from rr_actors.system.console.console_client import ConsoleClient, find_console, read_pages
+from rr_actors.system.console.console_questions import Find, ListChildren, ListResources, ReadResponse
+from rr_actors.system.recording.recordings import Recording, RecordingFile, add, present_entries, read_recording
 from rr_actors.system.recording.stream_recordings import LIMIT_BYTES
 from rr_actors.system.recording.timelines import read_timeline
-from rr_actors.system.recording.traces import Trace
+from rr_actors.system.recording.traces import Beginning, Trace, beginnings_of
 from rr_actors.tools import graphs
-from rr_actors.tools.cli_commands import JsonOption, StateOption, json_text, say, say_json, say_lines, say_picture
+from rr_actors.tools.cli_commands import (
+    JsonOption,
+    StateOption,
+    json_text,
+    say,
+    say_json,
+    say_lines,
+    say_picture,
+    say_table,
+)
 from rr_actors.tools.explanations import age_text, bytes_text, rate_text, readers_text
 from rr_actors.tools.tables.stream_table import stream_facts
 from rr_actors.tools.terminal.child_logs import LogText, events_of_child, log_of, new_lines, output_of
@@ -42,12 +52,17 @@ from rr_actors.tools.web.timeline_file import html
 app = typer.Typer()
 
 _LISTEN_S = 10.0
+_PRESENT = 10_000  # resources that a recording has from its beginning on
+_BEGIN_S = 5.0  # for an answer about what is there
 _ID = re.compile("[0-9a-f]{1,32}")
+_SUFFIX = ".jsonl"  # of the name of a file that may be missing
 
 
 @app.command(epilog="Example: rr-actors record crash.jsonl --seconds 30")
 def record(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A new file, for `sequence` and rr.read_recording().")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="A new file, for `trace`, `sequence` and rr.read_recording().")
+    ],
     seconds: Annotated[
         float | None, typer.Option(min=0.0, max=threading.TIMEOUT_MAX, help="End after so many. Default: at Ctrl-C.")
     ] = None,
@@ -59,42 +74,90 @@ def record(
         sink = RecordingFile(file, client.welcome.system, time.time())
         try:
             with _ending(client, seconds), suppress(KeyboardInterrupt):
-                for part in client.record():
+                parts = client.record()
+                sink.write(_present(state))
+                for part in parts:
                     missed += part.dropped
                     count += len(part.entries)
                     sink.write(part.entries, part.dropped)
         finally:
             sink.close()
     lost = f", {missed} missed" if missed else ""
-    say(f"recorded {count} entries in {file}{lost}")
+    say(f"recorded {counted(count, 'entry')} in {file}{lost}")
 
 
-@app.command(epilog="Example: rr-actors sequence 01a2085d3f7c --file crash.jsonl > load.mmd")
-def sequence(
-    of: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="WHAT...",
-            help="The id of a query, resource or message, or its beginning; or actors, root/ping. Default: all.",
-        ),
-    ] = None,
-    file: Annotated[Path | None, typer.Option(help="A recording. Default: record the running system now.")] = None,
-    seconds: Annotated[
-        float, typer.Option(min=0.0, max=threading.TIMEOUT_MAX, help="Without a file: for how long.")
-    ] = _LISTEN_S,
-    state: StateOption = None,
-    as_json: JsonOption = False,
+def _present(state: Path | None) -> list[Entry]:
+    """Return what is there now, by a connection of its own: that of the recording has no other use.
+
+    A system that hangs is recorded, too: then less is known of its beginning.
+    """
+    children, pages, notes = list[c.ChildRow](), list[c.Resources](), list[str]()
+    try:
+        with ConsoleClient(find_console(state)) as client:
+            ask = partial(client.ask, timeout_s=_BEGIN_S)
+            children += [row for page in read_pages(ask, ListChildren()) for row in page.rows]
+            pages += read_pages(ask, ListResources(), _PRESENT)
+    except RrError as error:
+        notes.append(text_of(error))
+    resources = [row for page in pages for row in page.rows]
+    notes += dict.fromkeys(note for page in pages for note in page.notes)
+    left_out = max((page.total for page in pages), default=0) - len(resources)
+    rows = map(msgspec.structs.asdict, children)
+    return present_entries(rows, resources, max(0, left_out), notes, time.time())
+
+
+_What = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="[FILE] [WHAT]...",
+        help="A recording (else the running system is recorded now), and of it: a name or a server; the id of a query, "
+        "resource or message, or its beginning; or actors, root/ping. Default: all.",
+    ),
+]
+_Seconds = Annotated[
+    float, typer.Option(min=0.0, max=threading.TIMEOUT_MAX, help="Without a file: record for so long.")
+]
+
+
+@app.command(epilog="Example: rr-actors sequence crash.jsonl 'cameras/camera \"front\"' > load.mmd")
+def sequence(what: _What = None, seconds: _Seconds = _LISTEN_S, state: StateOption = None) -> None:
+    """Draw loads, a message, or the messages of actors as a Mermaid sequence diagram."""
+    recording, of = _recorded(what or [], state, seconds)
+    say_lines(_drawn(recording, of).sequence())
+
+
+@app.command(epilog="Example: rr-actors trace crash.jsonl 'cameras/camera \"front\"'")
+def trace(
+    what: _What = None, seconds: _Seconds = _LISTEN_S, state: StateOption = None, as_json: JsonOption = False
 ) -> None:
-    """Draw a load, a message, or the messages of actors as a Mermaid sequence diagram; with --json, print entries."""
-    recording = _recorded(state, seconds) if file is None else read_recording(file)
-    if recording.missed:
-        say(f"{recording.missed} entries were missed, and are not in it", err=True)
-    trace = _drawn(recording, of or [])
-    if as_json:
-        for entry in trace.entries:
+    """List the loads and messages that a recording has; of a name, id or actor, show what happened, a line each.
+
+    What a callback loads, or a handler sends, is not listed: it is in the trace of what it is for.
+    """
+    recording, of = _recorded(what or [], state, seconds)
+    if of:
+        found = _drawn(recording, of)
+        for entry in found.entries if as_json else ():
             typer.echo(json_text(_line(entry)))
+        if not as_json:
+            say_lines(str(found))
+        return
+    beginnings = beginnings_of(recording.entries())
+    if as_json:
+        say_json(beginnings)
+    elif not beginnings:
+        say("nothing was loaded or sent while it was recorded", err=True)
     else:
-        say_lines(trace.sequence())
+        say_table(_HEADS, [_row(one) for one in beginnings], gives_way=("what",), right=("took",))
+
+
+_HEADS = ("time", "id", "by", "took", "what")
+
+
+def _row(one: Beginning) -> tuple[str, ...]:
+    took = "" if one.took_s is None else f"{one.took_s * 1000:.1f} ms"
+    what = f"{one.what}: {one.error}" if one.error else one.what
+    return time.strftime("%H:%M:%S", time.localtime(one.at)), one.id, one.by, took, what
 
 
 @app.command(epilog="Example: rr-actors timeline crash.jsonl > crash.svg")
@@ -109,27 +172,33 @@ def timeline(
     """Draw what happened: a lane for each child, a bar for each life, marks for events and their reasons."""
     drawn = read_timeline(file)
     if drawn.missed:
-        say(f"{drawn.missed} entries were missed, and are not in it", err=True)
+        say(f"the recording lacks {counted(drawn.missed, 'entry')}: its reader was too slow", err=True)
     typer.echo(drawn.svg() if format == "svg" else html(drawn))
 
 
 def _drawn(recording: Recording, of: list[str]) -> Trace:
-    """Return the trace of one id; or the messages of actors, whose names are tried first."""
+    """Return the trace of actors, whose names are tried first; or of one name or id."""
     try:
         return recording.messages(*of)
     except NotFound:
-        if len(of) != 1 or not _ID.fullmatch(of[0]):
+        if len(of) != 1 or not (_ID.fullmatch(of[0]) or "/" in of[0]):
             raise
     return recording.trace(of[0])
 
 
-def _recorded(state: Path | None, seconds: float) -> Recording:
-    with ConsoleClient(find_console(state)) as client:
-        recording = Recording(client.welcome.system)
-        with _ending(client, seconds), suppress(KeyboardInterrupt):
-            for part in client.record():
-                add(recording, part.entries, part.dropped)
-    return recording
+def _recorded(what: list[str], state: Path | None, seconds: float) -> tuple[Recording, list[str]]:
+    """Return the recording of a file if the first word names one, else of the running system; and the other words."""
+    if what and (what[0].endswith(_SUFFIX) or Path(what[0]).is_file()):
+        recording, what = read_recording(what[0]), what[1:]
+    else:
+        with ConsoleClient(find_console(state)) as client:
+            recording = Recording(client.welcome.system)
+            with _ending(client, seconds), suppress(KeyboardInterrupt):
+                for part in client.record():
+                    add(recording, part.entries, part.dropped)
+    if recording.missed:
+        say(f"the recording lacks {counted(recording.missed, 'entry')}: its reader was too slow", err=True)
+    return recording, what
 
 
 @contextmanager
@@ -198,7 +267,7 @@ def graph(
     draw = {"mermaid": graphs.mermaid, "dot": graphs.dot, "svg": graphs.svg, "png": graphs.svg}[format]
     say_picture(draw(rows, page.rows, of), format)
     if page.total > len(page.rows):
-        say(f"{page.total - len(page.rows)} resources are left out: raise --limit", err=True)
+        say(f"left out: {counted(page.total - len(page.rows), 'resource')}; raise --limit", err=True)
 
 
 @app.command(epilog="Example: rr-actors logs cameras --previous --lines 20")
@@ -396,7 +465,7 @@ def _record(client: ConsoleClient, row: StreamRow, file: Path, limit: int, frame
     finally:
         writer.close()
     lost = f", {missed} missed" if missed else ""
-    say(f"recorded {written} frames in {file}{lost}")
+    say(f"recorded {counted(written, 'frame')} in {file}{lost}")
 
 
 def _header(row: StreamRow, response: str) -> StreamHeader:

@@ -1,4 +1,4 @@
-"""The commands of `rr-actors` that look into a state directory."""
+"""The commands of `rr-actors` that look into a state directory, and into a recording."""
 
 from __future__ import annotations
 
@@ -8,14 +8,20 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
+import msgspec
 import typer
 
+from rr_actors.base.errors import UsageError, counted, shown
 from rr_actors.registrar.model.rows import Held, priority_of
 from rr_actors.registrar.pages import priority_text
 from rr_actors.system.console.console_client import find_console
-from rr_actors.tools.cli_commands import JsonOption, StateOption, WatchOption, say, say_table, shown_again
+from rr_actors.system.rewound.rewind_times import time_meant
+from rr_actors.system.rewound.rewinding import Rewound
+from rr_actors.system.rewound.rewinding import rewind as rewound_of
+from rr_actors.tools.cli_commands import JsonOption, StateOption, WatchOption, say, say_json, say_table, shown_again
 from rr_actors.tools.inspection import Contents, check_state, read_state, readable
 from rr_actors.tools.log_lines import printable
+from rr_actors.tools.tables import moment_tables as then
 
 app = typer.Typer()
 
@@ -88,7 +94,7 @@ def check(state_dir: StateDir = None, state_option: StateOption = None) -> None:
         raise typer.Exit(1)
     state = read_state(found)
     queries = sum(len(contents.queries) for contents in state.values())
-    typer.echo(f"{len(state)} catalogs, {queries} queries: they agree")
+    typer.echo(f"{counted(len(state), 'catalog')}, {counted(queries, 'query')}: no contradiction")
 
 
 def _show(contents: Contents) -> None:
@@ -102,7 +108,7 @@ def _show(contents: Contents) -> None:
     if contents.held:
         _say_held(contents)
     if contents.notices:
-        typer.echo(f"  {len(contents.notices)} status notices on their way")
+        typer.echo(f"  {counted(len(contents.notices), 'status notice')} not delivered yet")
     typer.echo()
 
 
@@ -181,6 +187,94 @@ def _branches(
         if provider and query and held.id not in way:
             below = provider.parts(query.resource_id)
             yield from _branches(below, state, guides, before + space, way | {held.id})
+
+
+# -- a recording -----------------------------------------------------------------------------------------------------
+
+
+@app.command(epilog="Example: rr-actors rewind crash.jsonl --when 'cameras ERROR'")
+def rewind(
+    what: Annotated[
+        Path,
+        typer.Argument(metavar="RECORDING|STATE_DIR", help="A file of `record`, a state directory, or its history."),
+    ],
+    at: Annotated[
+        str, typer.Option(metavar="TIME", help="12:46:55.020; or +12.5s from the beginning, -3m before the end.")
+    ] = "",
+    when: Annotated[
+        str, typer.Option(metavar="WHAT STATE", help="When it became so: 'cameras ERROR', 'root/maps restarting'.")
+    ] = "",
+    start: Annotated[str, typer.Option("--from", metavar="TIME", help="Show what is different since then.")] = "",
+    end: Annotated[str, typer.Option("--to", metavar="TIME", help="With --from: until then. Default: the end.")] = "",
+    as_json: JsonOption = False,
+) -> None:
+    """Show the tree and the resources as they were at any moment of a recording; in a terminal, step by step.
+
+    In a terminal, arrows step back and forward, and ? shows all keys. With an option, or without a terminal, it prints
+    the moment at a time, or the last one; when something came into a state; or what is different between two times.
+    """
+    if sum(map(bool, (at, when, start or end))) > 1:
+        raise UsageError("rewind: expected one of --at, --when, and --from with --to, got several")
+    rewound = rewound_of(what)
+    if not (at or when or start or end or as_json) and all(one.isatty() for one in (sys.stdin, sys.stdout)):
+        from rr_actors.tools.terminal import rewind_screen  # textual, which the other verbs do without
+
+        rewind_screen.watch(rewound)
+        return
+    for caveat in then.caveats(rewound):
+        say(caveat, err=True)
+    if when:
+        _say_when(rewound, when, as_json)
+    elif start or end:
+        _say_between(rewound, start or "start", end or "end", as_json)
+    else:
+        _say_moment(rewound, time_meant(at or "end", rewound.since, rewound.until), as_json)
+
+
+def _number(rewound: Rewound, text: str, option: str) -> int:
+    return rewound.number_at(time_meant(text, rewound.since, rewound.until, option))
+
+
+def _say_moment(rewound: Rewound, at: float, as_json: bool) -> None:
+    number = rewound.number_at(at)
+    moment = rewound.moment(number)
+    if as_json:
+        say_json(then.facts_of(rewound, number, moment, at))
+        return
+    say(then.headline(rewound, number, at))
+    tree, listed = moment.tree, moment.listed
+    heads, styles = then.CHILD_HEADS, then.styles_of(tree)
+    rows = [then.child_cells(child) for child in tree]
+    say_table(heads, rows, gives_way=("why",), right=("pid", "restarts"), styles=styles)
+    if listed:
+        say("")
+        rows = [then.resource_cells(one) for one in listed]
+        say_table(then.RESOURCE_HEADS, rows, gives_way=("message", "resource"), styles=then.styles_of(listed))
+
+
+def _say_when(rewound: Rewound, when: str, as_json: bool) -> None:
+    name, _, state = when.strip().rpartition(" ")
+    if not name:
+        raise UsageError(f"--when: expected a name and a state, such as 'cameras ERROR', got {shown(when)}")
+    found = rewound.when(name.strip(), state)
+    if as_json:
+        say_json([{"step": step.number, **msgspec.to_builtins(change)} for step, change in found])
+        return
+    rows = [(str(step.number), *then.change_cells(change)) for step, change in found]
+    say_table(("step", *then.CHANGE_HEADS), rows, gives_way=("why", "what"), right=("step",))
+
+
+def _say_between(rewound: Rewound, start: str, end: str, as_json: bool) -> None:
+    first, last = _number(rewound, start, "--from"), _number(rewound, end, "--to")
+    if first > last:
+        raise UsageError(f"--from: expected a time before --to, got {shown(start)}, after {shown(end)}")
+    found = rewound.between(first, last)
+    if as_json:
+        say_json(found)
+    elif not found:
+        say("nothing is different", err=True)
+    else:
+        say_table(then.CHANGE_HEADS, [then.change_cells(one) for one in found], gives_way=("why", "what"))
 
 
 def _plain(contents: Contents) -> dict[str, Any]:

@@ -104,8 +104,15 @@ VERBS: dict[str, dict[Callable[[], ModuleType | Declaring], dict[str, str]]] = {
     "Look at a running system": {
         **{_listed(sheet): {sheet.verb: sheet.says.partition("\n")[0].rstrip(".")} for sheet in SHEETS},
         _lists: {
+            "attention": (
+                "Show what needs attention, the worst first: what, since when, whom it touches, and the command that "
+                "leads on"
+            ),
             "usage": "Show what each resource uses now, CPU and memory for instance, of servers that can say it",
             "dead-letters": "Show how many messages could not be delivered, and the newest of them",
+            "hosts": (
+                "Show the other hosts that the system knows: whether each is reachable, since when, and what it exports"
+            ),
         },
         _console: {
             "events": "Show what happened lately to children and resources; with --follow go on with what happens",
@@ -218,19 +225,29 @@ VERBS: dict[str, dict[Callable[[], ModuleType | Declaring], dict[str, str]]] = {
                 "Say what cannot start of a tree: wrong keys, unknown classes, an on_start that waits for what "
                 "starts later"
             ),
+            "simulate": (
+                "Say what a tree does while children die, in virtual time: who is available, who restarts, when it "
+                "gives up"
+            ),
         },
     },
     "Record what happens": {
         _recording: {
             "record": "Record the events, exits, callbacks and messages of the system: of its actors and registrars",
-            "sequence": (
-                "Draw a load, a message, or the messages of actors as a Mermaid sequence diagram; with "
-                "--json, print entries"
+            "trace": (
+                "List the loads and messages that a recording has; of a name, id or actor, show what happened, a "
+                "line each"
             ),
+            "sequence": "Draw loads, a message, or the messages of actors as a Mermaid sequence diagram",
             "timeline": (
                 "Draw what happened: a lane for each child, a bar for each life, marks for events and their reasons"
             ),
-        }
+        },
+        _state: {
+            "rewind": (
+                "Show the tree and the resources as they were at any moment of a recording; in a terminal, step by step"
+            )
+        },
     },
     "Look into a state directory, whether its system runs or not": {
         _state: {
@@ -252,7 +269,8 @@ VERBS: dict[str, dict[Callable[[], ModuleType | Declaring], dict[str, str]]] = {
             "doctor": (
                 "Say what this machine lacks or limits of what a system needs, each with what to do; exit "
                 "code 1 if it lacks any"
-            )
+            ),
+            "learn": "Learn supervision and resources by exercises: mend a file, save it, and see what happens",
         },
         _project: {
             "version": "Print the version",
@@ -346,7 +364,12 @@ def _process(param: Any, plain: Callable[[str], object] | None, ctx: Any, value:
 
 
 app = typer.Typer(
-    name="rr-actors", cls=_Verbs, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False
+    name="rr-actors",
+    cls=_Verbs,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},  # of each verb, too
 )
 
 

@@ -287,7 +287,7 @@ def _columns(boxes: list[str], edges: set[Edge]) -> list[list[str]]:
 
 
 def _label(row: ResourceRow) -> str:
-    return named(row.server.partition("/")[2], row.request, _TEXT)
+    return named(row.server.partition("/")[2], row.text, _TEXT)
 
 
 # -- the rows of a picture where all resources are too many ------------------------------------------------------------

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from nicegui import background_tasks, ui
@@ -15,13 +16,15 @@ from nicegui import background_tasks, ui
 from rr_actors.base.errors import RrError
 from rr_actors.base.notebook import escape
 from rr_actors.tools.tables.sheets import Sheet
-from rr_actors.tools.tables.table import Look, Rows, Table, tables_of
+from rr_actors.tools.tables.table import Look, Row, Rows, Table, tables_of
 from rr_actors.tools.terminal.terminal_rows import LOOK_S, Hasty
+from rr_actors.tools.web.frame.detail_html import link_html
+from rr_actors.tools.web.frame.details import Link
+from rr_actors.tools.web.frame.live_html import LiveHtml
 from rr_actors.tools.web.page_parts import Page
 from rr_actors.tools.web.watch import Watch
 
 _ROWS = 300  # of each table
-_SORT = "(event) => { const head = event.target.closest('[data-sort]'); if (head) emit(head.dataset.sort); }"
 
 
 class ListPage(Page):
@@ -37,13 +40,14 @@ class ListPage(Page):
 
     def build(self) -> None:
         """Put the search and the tables on the page."""
-        self._match = ui.input("only rows with this text").props("dense outlined clearable debounce=200")
+        self._match = ui.input("only rows with this text", value=self.address.match, on_change=self._search)
+        self._match.props("dense outlined clearable debounce=200")
+        self.readdressed()
         self._match.classes("w-full")
-        self._shown: list[ui.html] = []
+        self._shown: list[LiveHtml] = []
         for table in self._tables:
             with ui.element("div").classes("rr-panel w-full"):
-                shown = ui.html("", sanitize=False).classes("w-full")
-                shown.on("click", lambda event, name=table.name: self._sort(name, str(event.args)), js_handler=_SORT)
+                shown = LiveHtml(lambda act, head, name=table.name: self._sort(name, head)).classes("w-full")
                 self._shown.append(shown)
         ui.label(self._note).classes("rr-note")
 
@@ -56,8 +60,19 @@ class ListPage(Page):
         """Return the second, as what waits grows older, and what the reader has chosen."""
         return int(time.monotonic()), self._match.value, dict(self._sorts)
 
+    def readdressed(self) -> None:
+        """Search and sort as the address says: of the sorts "servers.p95", the table and the head of its column."""
+        self._match.value = self.address.match
+        table, _, head = self.address.sort.partition(".")
+        self._sorts = {one.name: one.page_sort for one in self._tables} | ({table: head} if head else {})
+
+    def _search(self) -> None:
+        self.now_at(replace(self.address, match=self._match.value or ""))
+
     def _sort(self, table: str, head: str) -> None:
-        self._sorts[table] = "" if self._sorts[table] == head else head
+        is_back = self._sorts.get(table) == head
+        self.now_at(replace(self.address, sort="" if is_back else f"{table}.{head}"))
+        self._sorts[table] = "" if is_back else head
 
     async def _ask(self) -> None:
         self._is_asking = True
@@ -68,7 +83,7 @@ class ListPage(Page):
         finally:
             self._is_asking = False
         for table, shown, part in zip(self._tables, self._shown, parts, strict=True):
-            shown.content = _html(table, part, self._sorts[table.name])
+            shown.show(_html(table, part, self._sorts[table.name]))
 
     def _asked(self, match: str) -> list[Rows[Any]]:
         asks = Hasty(self.watch.link, LOOK_S)
@@ -83,7 +98,7 @@ def _html(table: Table[Any], part: Rows[Any], sort: str) -> str:
         f'<th scope="col" {place} {_SORTED * (column.head == sort)}>{_head(column.head, column.sorts)}</th>'
         for column, place in zip(columns, places, strict=True)
     )
-    body = "".join(f"<tr>{_cells(columns, places, row)}</tr>" for row in part.rows)
+    body = "".join(f"<tr>{_cells(table, columns, places, row)}</tr>" for row in part.rows)
     first = f": the first {len(part.rows):,}" if len(part.rows) < part.total else ""
     said = escape("; ".join((f"{table.caption(part.total)}{first}", *(f"not asked: {note}" for note in part.notes))))
     rows = f"<thead><tr>{heads}</tr></thead><tbody>{body}</tbody>" if part.rows else ""
@@ -94,11 +109,25 @@ _SORTED = 'aria-sort="descending"'
 
 
 def _head(head: str, sorts: bool) -> str:
-    return f'<button data-sort="{escape(head)}">{escape(head)}</button>' if sorts else escape(head)
+    return (
+        f'<button type="button" data-act="sort" data-of="{escape(head)}">{escape(head)}</button>'
+        if sorts
+        else escape(head)
+    )
 
 
-def _cells(columns: Sequence[Any], places: Sequence[str], row: Any) -> str:
+def _cells(table: Table[Any], columns: Sequence[Any], places: Sequence[str], row: Any) -> str:
+    line = table.line(row, True)
     return "".join(
-        f'<td data-head="{escape(column.head)}" {place}>{escape(column.cell(row))}</td>'
+        f'<td data-head="{escape(column.head)}" {place}>{link_html(_link(line, column.head, column.cell(row)))}</td>'
         for column, place in zip(columns, places, strict=True)
     )
+
+
+def _link(line: Row, head: str, text: str) -> Link:
+    """Return the text of a cell, as a link if it is the name of a thing."""
+    if line.resource and text and text == line.name:
+        return Link(text, "resource", line.resource)
+    if line.child is not None and text.strip() in (line.child.path, line.child.id):
+        return Link(text, "child", line.child.path)
+    return Link(text, "server" if head == "server" and "/" in text else "", text)

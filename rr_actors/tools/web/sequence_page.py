@@ -15,13 +15,13 @@ from functools import partial
 import msgspec
 from nicegui import Client, ui
 
-from rr_actors.actors.messaging.message_notes import MESSAGES
-from rr_actors.base.errors import RrError
+from rr_actors.base.errors import RrError, counted
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.recording.recordings import Recording, add
 from rr_actors.system.recording.sequence_diagrams import sequence_of
+from rr_actors.system.recording.traces import BEGINNINGS
 from rr_actors.tools.web.page_parts import Page
 from rr_actors.tools.web.watch import Moment, Watch
 
@@ -29,7 +29,6 @@ _LIMIT = 20_000  # entries of a page's recording
 _LISTED = 30
 _AROUND_S = 1.0
 _UNSEEN_S = 60.0
-_BEGINNINGS = {"Load", "Unload", *MESSAGES}
 _CRASHES = ("exited", "restarted", "start_failed", "gave_up", "stopped", "started")
 
 
@@ -106,7 +105,7 @@ class Recorder:
             for entry in self.recording.entries()
             if entry.event in _CRASHES
             or entry.event == "status"
-            or (entry.event == "sent" and entry.name in _BEGINNINGS and not entry.parent)
+            or (entry.event == "sent" and entry.name in BEGINNINGS and not entry.parent)
         ]
         return found[: -_LISTED - 1 : -1]
 
@@ -155,7 +154,7 @@ class SequencePage(Page):
         recorder = self._recorder
         count, missed, is_recording = recorder.extent
         lost = f", {missed} missed" if missed else ""
-        self._state.text = f"{count} entries{lost}{', recording' if is_recording else ''}"
+        self._state.text = f"{counted(count, 'entry')}{lost}{', recording' if is_recording else ''}"
         if (found := recorder.happenings()) == self._shown:
             return
         self._shown = found

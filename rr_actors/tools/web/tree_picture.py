@@ -13,16 +13,6 @@ from rr_actors.system.console.console_messages import ChildRow
 from rr_actors.tools.web.watch import Moment
 
 CSS = """
-:root { color-scheme: light dark;
-  --rr-edge: light-dark(#b0bec5, #47545c); --rr-outline: light-dark(#78909c, #7f929c);
-  --rr-paper: light-dark(#fff, #1d2327); --rr-text: light-dark(#1c2529, #e4eaed);
-  --rr-focus: light-dark(#1565c0, #7db9f5); --rr-fact: light-dark(#455a64, #a9b8c0);
-  --rr-count: light-dark(#b23c00, #ff9a6b); --rr-good: light-dark(#2e7d32, #5fc46a);
-  --rr-warm: light-dark(#ef8f00, #f2a93c); --rr-warm-paper: light-dark(#fff3d6, #4a3713);
-  --rr-still: light-dark(#757575, #98a2a8); --rr-still-paper: light-dark(#e6e6e6, #33393d);
-  --rr-bad: light-dark(#c62828, #ff8078); --rr-bad-paper: light-dark(#ffdede, #4d2020);
-  --rr-unknown-paper: light-dark(#eceff1, #2a3136); --rr-halo: light-dark(#90caf9, #2f6fa3);
-  --rr-dim: light-dark(#546e7a, #9fb0b9); --rr-amber: light-dark(#a15c00, #f2b53c); }
 .rr-tree, .rr-tree ul { list-style: none; margin: 0; padding: 0; }
 .rr-tree li { display: flex; align-items: flex-start; position: relative; padding: 2px 0; }
 .rr-tree ul { margin-left: 14px; padding-left: 18px; border-left: 2px solid var(--rr-edge); }
@@ -31,18 +21,17 @@ CSS = """
 .rr-tree ul::before { content: ""; position: absolute; margin-left: -33px; margin-top: 19px; width: 15px;
   border-top: 2px solid var(--rr-edge); }
 .rr-node { display: grid; grid-template-columns: 1fr auto; gap: 0 8px; text-align: left; min-width: 132px;
-  padding: 3px 9px; border: 2px solid var(--rr-outline); border-radius: 7px; background: var(--rr-paper);
+  padding: 3px 9px; border: 1px solid var(--rr-outline); border-radius: 8px; background: var(--rr-paper);
   color: var(--rr-text); font-size: 13px;
   line-height: 1.3; cursor: pointer; transition: background 0.3s, border-color 0.3s; }
 .rr-node:focus-visible { outline: 3px solid var(--rr-focus); outline-offset: 1px; }
 .rr-id { font-weight: 600; white-space: nowrap; }
 .rr-fact, .rr-window { grid-column: 1 / -1; font-size: 11px; color: var(--rr-fact); white-space: nowrap; }
 .rr-count { font-weight: 600; color: var(--rr-count); animation: rr-pop 0.6s; }
-.rr-running { border-color: var(--rr-good); } .rr-running .rr-sign { color: var(--rr-good); }
+.rr-running { border-color: var(--rr-edge); } .rr-running .rr-sign { color: var(--rr-good); }
 .rr-starting, .rr-restarting { border-color: var(--rr-warm); background: var(--rr-warm-paper); border-style: dashed; }
 .rr-stopped { border-color: var(--rr-still); background: var(--rr-still-paper); }
-.rr-unavailable { border-color: var(--rr-bad); background: var(--rr-bad-paper); border-style: double;
-  border-width: 4px; }
+.rr-unavailable { border-color: var(--rr-bad); background: var(--rr-bad-paper); border-width: 2px; }
 .rr-unknown { border-color: var(--rr-still); background: var(--rr-unknown-paper); border-style: dotted; }
 .rr-unknown .rr-sign { color: var(--rr-fact); }
 .rr-chosen { box-shadow: 0 0 0 3px var(--rr-halo); }

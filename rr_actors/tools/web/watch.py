@@ -25,6 +25,7 @@ from rr_actors.registrar.pages import ResourceRow, ServerRow
 from rr_actors.streams.stream import Stream
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
+from rr_actors.system.console.attention.attention_questions import Attention, ListAttention
 from rr_actors.system.console.console_client import read_pages
 from rr_actors.system.console.console_view import Verb
 from rr_actors.system.recording.event_memory import Event
@@ -147,6 +148,7 @@ class Watch:
         version: grows with each change that a page could show.
         figures: the figures of the children over the last minutes.
         pages: the names of the pages that are served.
+        attention: what needs attention.
     """
 
     state_dir: str | os.PathLike[str] | None
@@ -158,6 +160,7 @@ class Watch:
     welcome: c.Welcome | None = None
     lines: EventLines = field(default_factory=EventLines)
     pages: tuple[str, ...] = ()
+    attention: Attention = field(default_factory=lambda: Attention(0, []))
 
     def __post_init__(self) -> None:
         self.link = ConsoleLink(self.state_dir)
@@ -169,6 +172,7 @@ class Watch:
         self._lanes, self._lanes_lock = Lanes(), threading.Lock()
         self.figures = FigureCurves()
         self._thumbnails = Thumbnails()
+        self._attended = 0.0
         self._latest = 0.0  # the time of the newest event in the lanes
         self._known: set[float] = set()  # the times of those that were remembered, of which the feed may tell again
         self._lanes_of: tuple[int, list[Lane], float | None] | None = (
@@ -296,6 +300,8 @@ class Watch:
         try:
             registrars = self._ask(questions.ListRegistrars()).rows
             total, resources, servers = self._asked_resources(grouped=bool(self.now.servers))
+            if time.monotonic() > self._attended + _SELDOM_S:
+                self.attention, self._attended = self._ask(ListAttention()), time.monotonic()
         except RrError as error:
             self._change(partial(replace, stale=str(error)))
             return _SELDOM_S

@@ -12,7 +12,7 @@ import secrets
 from collections.abc import Awaitable, Callable, Collection, Iterable, MutableMapping
 from html import escape
 from typing import Any
-from urllib.parse import parse_qs, quote
+from urllib.parse import parse_qs, parse_qsl, quote, urlencode
 
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
@@ -76,7 +76,7 @@ class Access:
         if not problem and self._has(headers):
             await self._pass_on(scope, receive, _with_headers(send))
         elif not problem and scope["type"] == "http" and self._has_token(scope):
-            await _reply(send, 200, *self._welcome(scope["path"]))
+            await _reply(send, 200, *self._welcome(scope["path"], scope["query_string"].decode("latin-1")))
         else:
             text = problem or "open the address that rr-actors web has printed: it ends in a token"
             await _refuse(scope["type"], send, text)
@@ -132,12 +132,13 @@ class Access:
         query = parse_qs(scope["query_string"].decode("latin-1"))
         return any(_same(token, self._keys.token) for token in query.get("token", ()))
 
-    def _welcome(self, path: str) -> tuple[str, Iterable[tuple[bytes, bytes]]]:
-        """Return a page that sets the cookie and leads to the same path without the token.
+    def _welcome(self, path: str, query: str) -> tuple[str, Iterable[tuple[bytes, bytes]]]:
+        """Return a page that sets the cookie and leads to the same address without the token.
 
         It is no redirect: after a redirect, a browser that came from another page would not send a strict cookie.
         """
-        target = escape(self._prefix + quote("/" + path.lstrip("/\\")))
+        kept = urlencode([(key, value) for key, value in parse_qsl(query) if key != "token"])
+        target = escape(self._prefix + quote("/" + path.lstrip("/\\")) + (f"?{kept}" if kept else ""))
         cookie = f"{self._cookie}={self._keys.cookie}; HttpOnly; SameSite=Strict; Path={self._prefix}/"
         icon = '<link rel="icon" href="data:,">'  # else the browser asks for one outside of the prefix
         text = f'<!doctype html><meta http-equiv="refresh" content="0;url={target}">{icon}<title>rr-actors</title>'

@@ -8,66 +8,135 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from nicegui import background_tasks, ui
 
-from rr_actors.base.errors import RrError
+from rr_actors.base.errors import RrError, counted
 from rr_actors.base.notebook import escape
 from rr_actors.registrar.pages import ResourceRow
+from rr_actors.system.console.attention.attention_questions import Silence
+from rr_actors.system.recording.timelines import Timeline
 from rr_actors.tools.tables.resource_table import RESOURCES
-from rr_actors.tools.tables.row_commands import CHILD_COMMANDS, RESOURCE_COMMANDS
-from rr_actors.tools.tables.table import Row
-from rr_actors.tools.terminal.figure_curves import Curve
-from rr_actors.tools.terminal.terminal_rows import Neighbours, Past, graph_of
+from rr_actors.tools.terminal.figure_curves import STEP_S, STEPS, Curve
 from rr_actors.tools.web import graph_picture
-from rr_actors.tools.web.page_parts import Page, Panel, Pictures
+from rr_actors.tools.web.frame import overview
+from rr_actors.tools.web.frame.live_html import LiveHtml
+from rr_actors.tools.web.frame.page_addresses import Address
+from rr_actors.tools.web.page_parts import Page
 from rr_actors.tools.web.row_grid import Grid
 from rr_actors.tools.web.tree_picture import TreePicture
 from rr_actors.tools.web.watch import CHILDREN, Moment, Watch
 
-_PICTURE_S = 0.5
 _CURVES = 50  # children of which curves are drawn
 _STEP_S = 0.5
 """How long a status takes in the picture from one resource to the next. In the system it is too fast to see."""
 _STEPS = 30  # statuses
+_SILENCE_S = 600.0
 _NONE: dict[str, int] = {}
 
 
-class TreePage(Page):
-    """The page with the supervisor tree and the chosen child."""
+class OverviewPage(Page):
+    """The first page: whether all is well, what needs attention, and the last ten minutes of each child."""
+
+    goes_back = False
 
     def __init__(self, watch: Watch) -> None:
-        self._chosen = ""
         super().__init__(watch, "/")
 
     def build(self) -> None:
-        """Put the tree and the panel on the page."""
-        with ui.element("div").classes("rr-split"):
-            with ui.element("div").classes("rr-panel rr-holds-tree").style("flex: 3"):
-                self._tree = TreePicture(self._choose)
-                self._more = ui.label()
-            with ui.element("div").classes("rr-panel").style("flex: 2"):
-                self._panel = Panel(self, "Choose a child to see its history.")
+        """Put the head, the figures, the list and the lanes on the page."""
+        self._html = LiveHtml(self._silence).classes("rr-overview")
 
     def draw(self, moment: Moment) -> None:
-        """Show the tree, and ask for the rows of the chosen child."""
-        self._tree.show(moment, self._chosen)
+        """Show the overview."""
+        problem, timeline = moment.problem if moment.at else "", self.watch.timeline()
+        curves, troubles = self.watch.figures.curves(), self.watch.attention.items
+        parts = (
+            overview.head_card(troubles, problem),
+            overview.figures_html(_five(self.watch, moment, timeline, curves)),
+            overview.troubles_html(troubles, problem),
+            overview.lanes_html(timeline, moment.children, {path: _usage(of) for path, of in curves.items()}),
+        )
+        self._html.show("".join(parts))
+
+    def step(self) -> int:
+        """Return the second: times grow older."""
+        return int(time.monotonic())
+
+    async def _silence(self, act: str, item: str) -> None:
+        await self.carry_out(act, Silence(item, _SILENCE_S))
+
+
+def _usage(curves: Sequence[Curve]) -> str:
+    return " · ".join(curve.now for curve in curves if curve.kind.name in ("CPU", "memory") and curve.now)
+
+
+def _five(
+    watch: Watch, moment: Moment, timeline: Timeline, curves: Mapping[str, Sequence[Curve]]
+) -> Iterator[overview.Figure]:
+    """Yield the five figures of the overview."""
+    running = sum(row.state == "running" for row in moment.children)
+    count = len(moment.children)
+    look = "good" if running == count else "bad"
+    yield overview.Figure("Children running", f"{running:,}", f"of {count:,}", _running(watch), look)
+    died, most, each = overview.deaths(timeline)
+    yield overview.Figure("Deaths, last hour", f"{died:,}", most, each, "bad" if died else "still")
+    states = Counter[str]()
+    for row in moment.resources:
+        states[row.condition] += 1
+    for server in moment.servers:
+        states.update(server.states)
+    bad = ", ".join(f"{states[state]:,} {state}" for state in ("FATAL", "ERROR", "WARNING") if states[state])
+    held = overview.total(curves.values(), "resources")
+    yield overview.Figure("Resources", f"{moment.total:,}", bad, held)
+    loads = overview.total(curves.values(), "loads")
+    now = overview.newest(loads)
+    yield overview.Figure("Loads a second", "–" if now is None else f"{now:.1f}", "", loads)
+    cpu, memory = (overview.total(curves.values(), kind) for kind in ("CPU", "memory"))
+    used, taken = overview.newest(cpu), overview.newest(memory)
+    value = "–" if used is None else f"{used:.0f} %"
+    yield overview.Figure("CPU · memory", value, "" if taken is None else f"{taken:,.0f} MiB", cpu)
+
+
+def _running(watch: Watch) -> list[float | None]:
+    """Return how many children ran in the last ten minutes, a value for each five seconds."""
+    moments = [moment for moment in watch.moments.copy() if moment.at]
+    now = time.time()
+    values: list[float | None] = []
+    place = 0
+    for step in range(STEPS):
+        at = now - (STEPS - 1 - step) * STEP_S
+        while place + 1 < len(moments) and moments[place + 1].at <= at:
+            place += 1
+        known = moments and moments[place].at <= at
+        values.append(float(sum(row.state == "running" for row in moments[place].children)) if known else None)
+    return values
+
+
+class TreePage(Page):
+    """The page with the supervisor tree."""
+
+    def __init__(self, watch: Watch) -> None:
+        super().__init__(watch, "/tree")
+
+    def build(self) -> None:
+        """Put the tree on the page."""
+        with ui.element("div").classes("rr-panel rr-holds-tree w-full"):
+            self._tree = TreePicture(lambda path: self.choose("child", path))
+            self._more = ui.label()
+
+    def draw(self, moment: Moment) -> None:
+        """Show the tree."""
+        self._tree.show(moment, self.address.name)
         self._more.text = f"the first {CHILDREN} children" if len(moment.children) >= CHILDREN else ""
-        if self._chosen:
-            self._panel.offer(self._row(moment))
-            background_tasks.create(self._panel.ask())
 
-    async def _choose(self, path: str) -> None:
-        self._chosen = path
-        self._tree.show(self.moment, path)
-        await self._panel.show(Past(path), self._row(self.moment), CHILD_COMMANDS)
-
-    def _row(self, moment: Moment) -> Row:
-        child = next((row for row in moment.children if row.path == self._chosen), None)
-        return Row("", self._chosen, child=child)
+    def is_chosen(self, address: Address) -> None:
+        """Mark the chosen child."""
+        self._tree.show(self.moment, address.name)
 
 
 class FiguresPage(Page):
@@ -108,7 +177,7 @@ def _section(path: str, curves: Sequence[Curve]) -> str:
 
 
 class ResourcesPage(Page):
-    """The page with the resources: the picture of their dependencies beside the tree, and a table of all."""
+    """The page with the resources: a table of all, and below it the picture of their dependencies."""
 
     def __init__(self, watch: Watch) -> None:
         self._chosen = ""
@@ -119,52 +188,34 @@ class ResourcesPage(Page):
         super().__init__(watch, "/resources")
 
     def build(self) -> None:
-        """Put the tree, the graph, the panel and the table on the page."""
-        with ui.element("div").classes("rr-split"):
-            with ui.element("div").classes("rr-panel rr-holds-tree").style("flex: 2"):
-                self._tree = TreePicture(lambda path: ui.navigate.to("/"))
-            with ui.element("div").classes("rr-panel").style("flex: 4"):
-                with ui.row().classes("items-center gap-2"):
-                    self._said = ui.label().classes("rr-note")
-                    self._back = ui.button("all", on_click=self._show_all).props("dense no-caps outline")
-                self._graph_place = ui.element("div").classes("w-full").style("height: 48vh")
-            with ui.element("div").classes("rr-panel").style("flex: 2"):
-                self._panel = Panel(self, "Choose a resource to see its holders and parts.")
-                self._pictures = Pictures()
-                self._actions = ui.html("", sanitize=False).classes("rr-actions")
-        self._table = Grid(RESOURCES, "search in id, server, request and status", self._choose)
+        """Put the table and the graph on the page."""
+        self._table = Grid(RESOURCES, "search in id, server, request and status", self, "state")
+        with ui.element("div").classes("rr-panel w-full"):
+            with ui.row().classes("items-center gap-2"):
+                self._said = ui.label().classes("rr-note")
+                self._back = ui.button("all", on_click=self._show_all).props("dense no-caps outline")
+            self._graph_place = ui.element("div").classes("w-full").style("height: 40vh")
         ui.timer(0, self._add_libraries, once=True)
-        ui.timer(_PICTURE_S, self._look_at_streams)
 
     def _add_libraries(self) -> None:
-        """Add the graph and the table. Their libraries take a second to load, so tree and counts are shown first."""
+        """Add the graph and the table. Their libraries take a second to load, so the counts are shown first."""
         with self._graph_place:
             self._graph = ui.echart(self._options(self._seen()), on_point_click=self._clicked)
             self._graph.classes("rr-graph").style("height: 100%")
         self._table.fill()
 
-    async def _look_at_streams(self) -> None:
-        """Show the newest picture of each stream of the chosen resource."""
-        chosen = self._chosen if self.at is None else ""
-        seen = await asyncio.to_thread(self.watch.pictures_of, chosen) if chosen else {}
-        if chosen == (self._chosen if self.at is None else ""):  # nothing else was chosen meanwhile
-            self._pictures.show(seen)
-
     def draw(self, moment: Moment) -> None:
-        """Show the tree and the graph, and make the table and the panel ask for their rows again."""
-        self._tree.show(moment)
+        """Show the graph, and make the table ask for its rows again."""
         grouped = bool(moment.servers)
         if self._graph is not None:
             self._graph.options.clear()
             self._graph.options.update(self._options(self._seen()))
         how = ": the chosen one, with those above and below it" if self._focus else ": a click opens a server"
-        said = f"{moment.total:,} resource{'' if moment.total == 1 else 's'}{how * grouped}"
+        said = f"{counted(moment.total, 'resource')}{how * grouped}"
         self._said.text = "" if moment.stale is None else said  # they are not counted yet
         self._back.set_visibility(grouped and bool(self._focus or self._opened))
         if self.at is None:
             self._table.refresh()
-            background_tasks.create(self._panel.ask())
-            background_tasks.create(self._draw_actions())
             if grouped:
                 background_tasks.create(self._renew())
 
@@ -178,14 +229,6 @@ class ResourcesPage(Page):
     def _options(self, seen: Moment) -> graph_picture.Chart:
         chosen = self._chosen if any(row.id == self._chosen for row in seen.resources) else ""
         return graph_picture.chart(seen, chosen, self.step(), self._opened)
-
-    async def _draw_actions(self) -> None:
-        """Draw the actions of the chosen resource with their states, if it is a graph of actions."""
-        row = next((row for row in (*self.watch.now.resources, *self._focus) if row.id == self._chosen), None)
-        with contextlib.suppress(RrError):  # the next moment says why there is no answer
-            graph = None if row is None else await asyncio.to_thread(graph_of, self.watch.link, row)
-            if row is None or row.id == self._chosen:  # nothing else was chosen meanwhile
-                self._actions.content = "" if graph is None else graph.picture
 
     def step(self) -> set[str]:
         """Return the nodes that the newest statuses have just reached on their way up, slowed down for the picture.
@@ -204,7 +247,7 @@ class ResourcesPage(Page):
         name = str(event.name)
         if name.startswith(graph_picture.SERVER):
             return self._open(name.removeprefix(graph_picture.SERVER))
-        return None if name.startswith("@") else self._choose(name)
+        return self.choose("registrar", name[1:]) if name.startswith("@") else self.choose("resource", name)
 
     async def _open(self, server: str) -> None:
         """Draw the first resources of a server."""
@@ -213,7 +256,8 @@ class ResourcesPage(Page):
 
     def _show_all(self) -> None:
         self._opened.clear()
-        self._focus, self._chosen, self._drawn = [], "", None
+        self._focus, self._drawn = [], None
+        background_tasks.create(self.choose("", ""))
 
     async def _renew(self) -> None:
         """Ask again for the rows of opened servers, and of the resource that is shown with its neighbours."""
@@ -233,10 +277,13 @@ class ResourcesPage(Page):
             ):
                 self._focus, self._opened, self._drawn = focus, opened, None
 
-    async def _choose(self, id: str) -> None:
-        self._chosen = id
+    def is_chosen(self, address: Address) -> None:
+        """Light up the chosen resource with its holders and parts."""
+        self._chosen = address.name if address.kind == "resource" else ""
         self._drawn = None
-        if self.watch.now.servers:
-            await self._renew()
-        name = next((row.name for row in (*self.watch.now.resources, *self._focus) if row.id == id), "")
-        await self._panel.show(Neighbours(id, name), Row(id, name, resource=id, name=name), RESOURCE_COMMANDS)
+        if self.watch.now.servers and self._chosen:
+            background_tasks.create(self._renew())
+
+    def readdressed(self) -> None:
+        """Search and sort as the address says."""
+        self._table.follow(self.address)

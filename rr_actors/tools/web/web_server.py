@@ -28,6 +28,7 @@ from rr_actors.system.recording.figures import prometheus_text
 from rr_actors.system.web_process import check_proxy
 from rr_actors.tools.tables.resource_table import RESOURCES
 from rr_actors.tools.tables.sheets import SHEETS
+from rr_actors.tools.web.frame.names_found import add_names
 from rr_actors.tools.web.lab.lab_pages import add_lab
 from rr_actors.tools.web.list_page import ListPage
 from rr_actors.tools.web.page_parts import address_of
@@ -36,7 +37,7 @@ from rr_actors.tools.web.sequence_page import Recorder, SequencePage, end_unseen
 from rr_actors.tools.web.timeline_page import TimelinePage
 from rr_actors.tools.web.watch import Watch
 from rr_actors.tools.web.web_access import Access, Keys, is_loopback
-from rr_actors.tools.web.web_pages import FiguresPage, ResourcesPage, TreePage
+from rr_actors.tools.web.web_pages import FiguresPage, OverviewPage, ResourcesPage, TreePage
 
 _CLOSE_S = 1
 _LOOK_S = 20.0
@@ -89,6 +90,7 @@ def serve(
         watch = Watch(state_dir)
         recorder = Recorder(watch)
         pages = {
+            "Overview": partial(OverviewPage, watch),
             "Tree": partial(TreePage, watch),
             "Timeline": partial(TimelinePage, watch),
             "Resources": partial(ResourcesPage, watch),
@@ -100,6 +102,7 @@ def serve(
         for name, page in pages.items():
             ui.page(address_of(name), title=f"rr-actors: {name.lower()}")(page)
         add_rows(watch, RESOURCES)
+        add_names(watch, {name: address_of(name) for name in pages})
         _add_metrics(watch)
         app.on_startup(watch.start)
         app.on_startup(partial(_begin_to_look, recorder))

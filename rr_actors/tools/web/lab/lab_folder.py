@@ -25,7 +25,7 @@ import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple, get_args, get_type_hints
+from typing import NamedTuple, TypeVar, get_args, get_type_hints
 
 from rr_actors.base.errors import ConfigError, UsageError, did_you_mean
 from rr_actors.base.toml import parse_typed, raise_faults, wrong
@@ -35,6 +35,7 @@ from rr_actors.tools.web.lab.lab_declarations import LabDeclaration, LabExperime
 _BLOCK = re.compile(r"^# /// lab\n((?:#(?: .*)?\n)*?)# ///[ \t]*$", re.MULTILINE)
 _BEGIN = re.compile(r"^[ \t]*#[ \t]*///[ \t]*lab\b.*", re.MULTILINE)
 _LOOK_FOR, _WHY = "Look for:", "Why:"
+_Declaration = TypeVar("_Declaration", bound=LabDeclaration)
 _EVENTS: tuple[str, ...] = get_args(get_type_hints(ChildEvent)["event"])
 _TYPES: Mapping[str, tuple[type, ...]] = {"int": (int,), "float": (float, int), "str": (str,)}
 """The annotations of a parameter that say which values its lever may have."""
@@ -119,7 +120,7 @@ def read_experiment(file: Path) -> LabExperiment:
     if main is None or not main.args.args or docstring is None:
         missing = "a function main(state_dir, ...)" if docstring is not None else "a docstring"
         raise wrong(name, "", missing, None, said="none")
-    declared = _declared(text, f"{file}: lab")
+    declared = declared_in(text, f"{file}: lab", LabDeclaration)
     raise_faults([*_faults(declared, _parameters(main), f"{file}: lab")])
     title, _, rest = inspect.cleandoc(docstring).partition("\n")
     rest, _, why = rest.partition(_WHY)
@@ -142,8 +143,12 @@ def _parsed(file: Path) -> tuple[str, ast.Module]:
     raise ConfigError(f"{file}: expected a Python program, got: {said}", file=str(file))
 
 
-def _declared(text: str, name: str) -> LabDeclaration:
-    """Return what the block of a program declares. Errors have the lines of the file."""
+def declared_in(text: str, name: str, kind: type[_Declaration]) -> _Declaration:
+    """Return what the block of a program declares; nothing without a block. Errors have the lines of the file.
+
+    Raises:
+        ConfigError: the block has another form, an unknown key or a wrong value, or it is one of several.
+    """
     begun, blocks = list(_BEGIN.finditer(text)), list(_BLOCK.finditer(text))
     if len(begun) > 1:
         raise wrong(name, "", "one block", None, said=f"another at line {_line(text, begun[1].start())}")
@@ -151,9 +156,9 @@ def _declared(text: str, name: str) -> LabDeclaration:
         expected = 'lines from "# /// lab" to "# ///" that begin with "# "'
         raise wrong(name, "", expected, None, said=f"another form at line {_line(text, begun[0].start())}")
     if not blocks:
-        return LabDeclaration()
+        return kind()
     above = "\n" * (_line(text, blocks[0].start(1)) - 1)
-    return parse_typed((above + re.sub("^# ?", "", blocks[0][1], flags=re.MULTILINE)).encode(), name, LabDeclaration)
+    return parse_typed((above + re.sub("^# ?", "", blocks[0][1], flags=re.MULTILINE)).encode(), name, kind)
 
 
 def _line(text: str, at: int) -> int:

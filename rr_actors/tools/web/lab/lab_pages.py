@@ -203,7 +203,7 @@ class LabPage:
         with ui.row().classes("gap-4"):
             for lever in experiment.levers:
                 select = ui.select([str(choice) for choice in lever.choices], label=lever.label)
-                select.props("dense outlined").style("min-width: 13rem")
+                select.props("dense outlined").style("min-width: 14.5rem")
                 select.bind_value(self._levers, lever.name).on_value_change(self._link)
         if experiment.question is not None:
             _heading(experiment.question.text, 2)
