@@ -4,6 +4,7 @@
 #   make lab    experiments to learn from, on a web page: kill a child and see what its supervisor does
 #   make test   the tests, side by side on two cores and more: ten minutes on two
 #   make test-all  those that take longer, too: faults at every operation, fixed worlds of the simulation, breakages
+#   make test-ros  those among real nodes of ROS 2, in an environment of its own, .venv-ros, with rclpy from wheels
 #   make lint   ruff, pyright, import-linter
 #   make docs   the docs as a site, in build/docs/index.html, with the reference of all public names; without the network
 #   make names  docs/names.md, and the texts of docs/reference, from the code
@@ -42,7 +43,7 @@ SLOW_SIDE_BY_SIDE := -n $(shell echo $$(($(CORES) < 4 ? $(CORES) + 1 : 4)))
 # (docs/decisions/0073-a-second-run-that-is-counted.md). One test alone, `pytest tests/...`, has no second run.
 SECOND_RUN := --reruns 1 -raR
 
-.PHONY: demo lab docs names test test-slow test-all lint format chaos breakages simulate explore streams fuzz fuzz-quick bench bench-quick bench-peers figures constraints clean
+.PHONY: demo lab docs names test test-slow test-all test-ros lint format chaos breakages simulate explore streams fuzz fuzz-quick bench bench-quick bench-peers figures constraints clean
 .DELETE_ON_ERROR:
 
 # Where nothing is set up yet, these two do not wait for what the tests need.
@@ -61,12 +62,15 @@ names: $(STAMP)
 	$(BIN)/python docs/_site/reference.py
 
 test: $(STAMP)
-	$(BIN)/python -m pytest $(SIDE_BY_SIDE) $(SECOND_RUN) -m "not slow" $(ARGS)
+	$(BIN)/python -m pytest $(SIDE_BY_SIDE) $(SECOND_RUN) -m "not slow and not ros" $(ARGS)
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest $(SLOW_SIDE_BY_SIDE) $(SECOND_RUN) -m slow $(ARGS)
 
 test-all: test-slow test
+
+test-ros: .venv-ros/.installed
+	.venv-ros/bin/python -m pytest -m ros tests/managers/test_ros2_peers.py $(ARGS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
@@ -134,6 +138,15 @@ $(STAMP): pyproject.toml constraints.txt
 
 $(VENV)/.installed-%: pyproject.toml constraints.txt
 	$(call INSTALL,$*)
+
+# rclpy comes with a distribution of ROS, or as wheels: it is no dependency of rr_actors, and of no extra.
+.venv-ros/.installed: pyproject.toml constraints.txt
+	@echo "Setting up .venv-ros with rclpy and what its tests need: this takes a minute or so, and is done once."
+	@test -x .venv-ros/bin/python || "$(PYTHON)" -m venv .venv-ros
+	@.venv-ros/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable . \
+		pytest pytest-timeout pytest-rerunfailures pytest-xdist hypothesis \
+		"ros-jazzy-rclpy[fastrtps]" ros-jazzy-std-msgs ros-jazzy-std-srvs
+	@touch $@
 
 # On the oldest Python: what is for that one is for the later ones too.
 constraints:

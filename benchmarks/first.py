@@ -24,7 +24,7 @@ def first_and_last(times: int) -> list[Row]:
         processes = provider_processes(times)
         for _ in range(processes):
             with placed(placement, durability) as (echo, _, consumer):
-                one_pipe, one = _measure(echo, consumer, max(1, times // ROUNDS // processes))
+                one_pipe, one = measured(echo, consumer, times // processes)
             pipe += one_pipe
             taken = {what: taken.get(what, Samples(())) + samples for what, samples in one.items()}
         if durability == DURABILITIES[0]:
@@ -37,8 +37,10 @@ def first_and_last(times: int) -> list[Row]:
     return rows
 
 
-def _measure(echo: Callable[[], Any], consumer: rr.Registrar, a_round: int) -> tuple[Samples, dict[str, Samples]]:
-    pipe: list[float] = []
+def measured(yardstick: Callable[[], Any], consumer: rr.Registrar, times: int) -> tuple[Samples, dict[str, Samples]]:
+    """The yardstick, and each of the operations, so many times in turns."""
+    a_round = max(1, times // ROUNDS)
+    beside: list[float] = []
     first: list[float] = []
     last: list[float] = []
     at_once: list[float] = []
@@ -53,10 +55,10 @@ def _measure(echo: Callable[[], Any], consumer: rr.Registrar, a_round: int) -> t
     consumer.load(SERVER, Ask(-1)).unload()  # connects
     for number in range(ROUNDS):
         requests = [Ask(number * a_round + i) for i in range(a_round)]
-        pipe += time_each(echo, a_round)
+        beside += time_each(yardstick, a_round)
         first += time_with(load, requests)
         last += time_with(unload, queries)
         queries.clear()
         at_once += time_with(unload, (consumer.load(SERVER, request) for request in requests))
     taken = {"first load": first, "unload of the last holder": last, "the same, at once after the load": at_once}
-    return Samples(tuple(pipe)), {what: Samples(tuple(seconds)) for what, seconds in taken.items()}
+    return Samples(tuple(beside)), {what: Samples(tuple(seconds)) for what, seconds in taken.items()}

@@ -12,10 +12,10 @@ import rr_actors as rr
 from benchmarks.measure import Samples, interleaved, time_each
 from benchmarks.table import Row
 from rr_actors.managers import Actions, Alternative, Budgets, Choices, Choose, Pool, Programs, RunProgram, Share
-from rr_actors.managers.budgets.planner import Asked, Running, plan
-from rr_actors.managers.keeper.comparing import Seen, compare, report
+from rr_actors.managers.budgets.planner import AskedShare, HeldShare, plan
+from rr_actors.managers.keeper.comparing import SeenReplica, compare, report
 from rr_actors.managers.keeper.desired import parse_desired
-from rr_actors.managers.pipes.chains import Goal, Link, best_chain
+from rr_actors.managers.pipes.chains import ChainComponent, Goal, best_chain
 
 SHARE_AIM_MS = 1.5
 PLANNER_AIM_MS = 10.0
@@ -103,8 +103,8 @@ def _share(times: int) -> list[Row]:
 
 
 def _planner(shares: int) -> Row:
-    running = [Running(str(number), 1.0, number % 10, float(number)) for number in range(shares)]
-    asked = [Asked("new", shares / 100, 5)]
+    running = [HeldShare(str(number), 1.0, number % 10, float(number)) for number in range(shares)]
+    asked = [AskedShare("new", shares / 100, 5)]
     taken = Samples(tuple(time_each(lambda: plan(float(shares), POLICY, running, asked), 20)))
     name = f"planner, {shares:,} shares: one that is to be made room for"
     return Row(name, taken.median * 1e3, "ms", taken.p99 * 1e3, at_most=PLANNER_AIM_MS)
@@ -171,10 +171,10 @@ def _choice(times: int) -> list[Row]:
 def _pipe(components: int) -> Row:
     """Choose a chain of ten among components that can stand in one of its places each, and fit all before them."""
 
-    def link(number: int) -> Link:
+    def link(number: int) -> ChainComponent:
         place, trust = number % _PIPE_STAGES, 1 - (number * 7919 % components) / components / 10
         inputs, outputs = ({f"data {place}"} if place else set[str](), {f"data {place + 1}"})
-        return Link(f"{number}", "any", frozenset(inputs), frozenset(outputs), trust)
+        return ChainComponent(f"{number}", "any", frozenset(inputs), frozenset(outputs), trust)
 
     links, goal = [link(number) for number in range(components)], Goal(f"data {_PIPE_STAGES}")
 
@@ -193,7 +193,7 @@ def _keep(kept: int) -> Row:
     text = f'[[keep]]\nname = "a"\nserver = "b/c"\nrequest = "{{instance}}"\nreplicas = {kept}\n'
     desired = parse_desired(text.encode(), "keep.toml")
     wanted = [one for one, _ in desired.replicas("keeper/group")]
-    there = [Seen(one.keep, one.instance, one.what) for one in wanted if one.instance % 10]
+    there = [SeenReplica(one.keep, one.instance, one.what) for one in wanted if one.instance % 10]
 
     def look() -> None:
         steps = compare(wanted, there, {}, 0.0)

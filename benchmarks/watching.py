@@ -32,6 +32,7 @@ _CPU_PERCENT, _MORE_MIB = 10.0, 50.0
 _DISTURBED = 1.05
 _SLOWER = 20  # times, of the slow browser's processor
 _SETTLE_S = 3.0
+_HAS_LANES = "() => document.querySelector('.rr-lanes')"
 _HAS_ROWS = "() => document.querySelector('.ag-row')"
 _PATIENCE_MS = 60_000
 _AT_ONCE = 500
@@ -151,7 +152,7 @@ def watching(browser: Browser, managers: int, resources: int, events: int, turns
         drivers = {one.pid for one in own} - set(_pids(system).values()) - {os.getpid()}
         own = [one for one in own if one.pid not in drivers]
         without, watched = _Costs(app, 2_000, seconds), _Costs(app, 2_000, seconds)
-        paints: dict[str, list[float]] = {"tree": [], "resources": [], "rows of the table": []}
+        paints: dict[str, list[float]] = {"overview": [], "tree": [], "resources": [], "rows of the table": []}
         server: list[float] = []
         late: list[float] = []
         for turn in range(turns):
@@ -166,7 +167,8 @@ def watching(browser: Browser, managers: int, resources: int, events: int, turns
                     page.goto(served.url)
                     page.wait_for_url(lambda url: "token=" not in url)
                 nodes = f"() => document.querySelectorAll('[data-path]').length > {managers}"
-                paints["tree"] += _painted(first, address, nodes)
+                paints["overview"] += _painted(first, address, _HAS_LANES)
+                paints["tree"] += _painted(first, f"{address}tree", nodes)
                 drawn = f"() => document.body.innerText.includes('{resources + managers:,} resources')"  # the counts
                 counts_s, rows_s = _painted(other, f"{address}resources", drawn, _HAS_ROWS)
                 paints["resources"].append(counts_s)

@@ -17,23 +17,26 @@ from rr_actors.managers import Alternative, Choices, Choose
 
 class Sensors(rr.Manager):
     def __init__(self, rate_hz: float) -> None:
-        self.rate_hz, self.off = rate_hz, threading.Event()
+        self.rate_hz = rate_hz
+        self.off: dict[str, threading.Event] = {}  # by the id of the resource: there may be two for a while
 
     @rr.server("sensor", recovery="lost")  # a sensor does not outlive its process
     def open_sensor(self) -> rr.Stream:
-        ranges, off = rr.current().open_stream("ranges"), threading.Event()
+        me = rr.current()
+        ranges, off = me.open_stream("ranges"), threading.Event()
 
         def run() -> None:
             while not off.wait(1 / self.rate_hz):
                 ranges.publish((self.registrar.name, os.getpid()))
 
         threading.Thread(target=run, daemon=True).start()
-        self.off = off
+        self.off[me.resource_id] = off
         return ranges.stream
 
     @open_sensor.unload
     def close_sensor(self, response: rr.Stream | None) -> None:
-        self.off.set()
+        if off := self.off.pop(rr.current().resource_id, None):
+            off.set()
 
 
 RATES = {"camera": 60, "lidar": 30}  # readings in a second

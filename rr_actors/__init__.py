@@ -28,6 +28,7 @@ TYPE_CHECKING = False  # type checkers take it for true; to import that of typin
 if TYPE_CHECKING or getattr(_sys, "frozen", False):
     with _left_alone():
         from rr_actors.actors.actor import IGNORE, Actor, ExitReport
+        from rr_actors.actors.actor_tables import TableColumn, table
         from rr_actors.actors.mailbox_refs import MailboxRef
         from rr_actors.actors.messaging.dead_letters import DeadLetter, DeadLetters
         from rr_actors.actors.messaging.exit_reports import Down
@@ -51,6 +52,7 @@ if TYPE_CHECKING or getattr(_sys, "frozen", False):
             ConfigError,
             Frame,
             GraphError,
+            HostUnreachable,
             InvalidName,
             InvalidRequest,
             InvalidResponse,
@@ -59,12 +61,15 @@ if TYPE_CHECKING or getattr(_sys, "frozen", False):
             LoadFailed,
             LoadTimeout,
             MailboxFull,
+            MissingDependency,
             NameTaken,
+            NotExported,
             NotForDynamic,
             NotFound,
             NotHolder,
             NotRunning,
             NotSerializable,
+            ProtocolMismatch,
             RegistrarDown,
             ResourceBusy,
             ResourceLost,
@@ -74,6 +79,7 @@ if TYPE_CHECKING or getattr(_sys, "frozen", False):
             SupervisionError,
             TooManyChildren,
             Unavailable,
+            UnknownHost,
             UnknownQuery,
             UnknownRegistrar,
             UnknownServer,
@@ -95,7 +101,7 @@ if TYPE_CHECKING or getattr(_sys, "frozen", False):
         from rr_actors.streams.stream_file import RecordedStream
         from rr_actors.streams.stream_reader import StreamReader
         from rr_actors.supervision.core.rendering import Tree, render
-        from rr_actors.supervision.core.specs import Backoff, ChildSpec, Supervisor
+        from rr_actors.supervision.core.specs import Backoff, ChildModel, ChildSpec, Exponential, Supervisor, Uniform
         from rr_actors.supervision.supervisor import Child, Counts, SupervisorRef
         from rr_actors.system.console.asking.client_proxies import ClientProxy
         from rr_actors.system.console.connected_client import Client, ClientQuery, ClientRegistrar, connect
@@ -109,15 +115,21 @@ if TYPE_CHECKING or getattr(_sys, "frozen", False):
             ResourceEvent,
             StreamEvent,
         )
+        from rr_actors.system.hosts.host_settings import Export, Hosts
         from rr_actors.system.recording.recordings import Recording, read_recording
         from rr_actors.system.recording.stream_recordings import StreamRecording, read_stream, record_stream
         from rr_actors.system.recording.traces import Trace
+        from rr_actors.system.simulated.simulated_runs import ChildOutcome, SimulatedRun, simulate
+        from rr_actors.system.simulated.tree_experiments import TreeExperiment, experiment
+        from rr_actors.system.snapshots import Preview
         from rr_actors.system.system import System
+        from rr_actors.wire.name_service import HostInfo
 
 if TYPE_CHECKING:
     from rr_actors import managers as managers
     from rr_actors.managers import Action, GraphResult, run_graph
-    from rr_actors.testing.pytest_plugin import StartSystem
+    from rr_actors.managers.ros import ros2 as ros2
+    from rr_actors.testing.started_systems import StartSystem
 
 __all__ = [
     "IGNORE",
@@ -136,6 +148,8 @@ __all__ = [
     "CatalogVersion",
     "Child",
     "ChildEvent",
+    "ChildModel",
+    "ChildOutcome",
     "ChildRestarting",
     "ChildRunning",
     "ChildSpec",
@@ -155,10 +169,15 @@ __all__ = [
     "EndedEvent",
     "Event",
     "ExitReport",
+    "Exponential",
+    "Export",
     "Frame",
     "GraphError",
     "GraphResult",
     "Health",
+    "HostInfo",
+    "HostUnreachable",
+    "Hosts",
     "InvalidName",
     "InvalidRequest",
     "InvalidResponse",
@@ -172,15 +191,19 @@ __all__ = [
     "Manager",
     "MessageInfo",
     "MissedEvent",
+    "MissingDependency",
     "Monitor",
     "NameTaken",
+    "NotExported",
     "NotForDynamic",
     "NotFound",
     "NotHolder",
     "NotRunning",
     "NotSerializable",
+    "Preview",
     "Progress",
     "ProgressEvent",
+    "ProtocolMismatch",
     "Publisher",
     "Queries",
     "Query",
@@ -195,6 +218,7 @@ __all__ = [
     "ResourceLost",
     "RestartIntensityExceeded",
     "RrError",
+    "SimulatedRun",
     "StartFailed",
     "StartSystem",
     "State",
@@ -211,11 +235,15 @@ __all__ = [
     "SupervisorRef",
     "System",
     "SystemConfig",
+    "TableColumn",
     "Timer",
     "TooManyChildren",
     "Trace",
     "Tree",
+    "TreeExperiment",
     "Unavailable",
+    "Uniform",
+    "UnknownHost",
     "UnknownQuery",
     "UnknownRegistrar",
     "UnknownServer",
@@ -224,6 +252,7 @@ __all__ = [
     "codec",
     "connect",
     "current",
+    "experiment",
     "monitor",
     "read_recording",
     "read_stream",
@@ -233,6 +262,8 @@ __all__ = [
     "run_graph",
     "send_after",
     "server",
+    "simulate",
+    "table",
 ]
 
 
@@ -244,6 +275,7 @@ def __dir__() -> list[str]:
 if not TYPE_CHECKING:
     _NAMES = {
         "rr_actors.actors.actor": "Actor ExitReport IGNORE",
+        "rr_actors.actors.actor_tables": "TableColumn table",
         "rr_actors.actors.mailbox_refs": "MailboxRef",
         "rr_actors.actors.messaging.dead_letters": "DeadLetter DeadLetters",
         "rr_actors.actors.messaging.exit_reports": "Down",
@@ -268,18 +300,23 @@ if not TYPE_CHECKING:
         "rr_actors.registrar.queries": "Query ResourceInfo Status Subscription",
         "rr_actors.registrar.registrar": "Registrar",
         "rr_actors.supervision.core.rendering": "Tree render",
-        "rr_actors.supervision.core.specs": "Backoff ChildSpec Supervisor",
+        "rr_actors.supervision.core.specs": "Backoff ChildModel ChildSpec Exponential Supervisor Uniform",
         "rr_actors.supervision.supervisor": "Child Counts SupervisorRef",
         "rr_actors.system.console.asking.client_proxies": "ClientProxy",
         "rr_actors.system.console.connected_client": "Client ClientQuery ClientRegistrar connect",
         "rr_actors.system.event_subscribers": (
             "ChildEvent DeadLetterEvent EndedEvent Event MissedEvent ProgressEvent ResourceEvent StreamEvent"
         ),
+        "rr_actors.system.hosts.host_settings": "Export Hosts",
         "rr_actors.system.recording.recordings": "Recording read_recording",
         "rr_actors.system.recording.stream_recordings": "StreamRecording read_stream record_stream",
         "rr_actors.system.recording.traces": "Trace",
+        "rr_actors.system.simulated.simulated_runs": "ChildOutcome SimulatedRun simulate",
+        "rr_actors.system.simulated.tree_experiments": "TreeExperiment experiment",
+        "rr_actors.system.snapshots": "Preview",
         "rr_actors.system.system": "System",
-        "rr_actors.testing.pytest_plugin": "StartSystem",
+        "rr_actors.wire.name_service": "HostInfo",
+        "rr_actors.testing.started_systems": "StartSystem",
     }
     _MODULES = dict.fromkeys(__all__, "rr_actors.base.errors")  # but for these
     _MODULES |= {name: module for module, names in _NAMES.items() for name in names.split()}
@@ -293,6 +330,8 @@ if not TYPE_CHECKING:
         """
         if name == "managers":
             return _importlib.import_module("rr_actors.managers")
+        if name == "ros2":
+            return _importlib.import_module("rr_actors.managers.ros.ros2")
         if name not in _MODULES:
             raise AttributeError(
                 f"module {__name__!r} has no attribute {name!r}", name=name, obj=_sys.modules[__name__]

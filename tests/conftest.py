@@ -24,7 +24,7 @@ from hypothesis import settings
 import rr_actors as rr
 from rr_actors.base.reporting import log
 from rr_actors.runtime import thread_rules
-from support import BROWSERS, TEST_PATHS, Gate, Served, Workshop, eventually, serve
+from support import BROWSERS, TEST_PATHS, WARM, Gate, Served, Workshop, eventually, serve
 from warm_servers import WarmServers, warm_servers
 
 _MARK = "RR_ACTORS_TESTS"
@@ -108,11 +108,19 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="session", autouse=True)
 def warm() -> Iterator[WarmServers]:
-    """The process that forks the fork servers of tests whose folder asks for it."""
+    """What launches fork servers and web pages: each is forked from a process that has imported what it needs."""
     with warm_servers() as servers:
         yield servers
+
+
+@pytest.fixture(autouse=True)
+def _starts_cold(request: pytest.FixtureRequest, warm: WarmServers) -> Iterator[None]:
+    """A test with the mark `cold` has fork servers and pages started as users have them."""
+    warm.is_on = request.node.get_closest_marker("cold") is None
+    yield
+    warm.is_on = True
 
 
 _others = {int(name) for name in os.listdir("/proc") if name.isdigit()} - {os.getpid()}  # processes that are not ours
@@ -139,6 +147,7 @@ def _processes() -> set[tuple[int, float]]:
                 _others.add(pid)
         except (OSError, psutil.NoSuchProcess):
             continue
+    found = {one for one in found if one[0] not in WARM}
     return found if not BROWSERS else {one for one in found if not _is_of_a_browser(one[0])}
 
 

@@ -33,7 +33,7 @@ T = TypeVar("T")
 BROWSERS: set[int] = set()
 """Browsers that serve all tests of a module. They start and end processes of their own as they like."""
 WARM: set[int] = set()
-"""The process that forks fork servers for tests, a child of this one (warm_servers.py)."""
+"""The processes that fork fork servers and pages for tests, children of this one (warm_servers.py)."""
 LIMIT_S = 10.0
 """How long a test waits for something that is promised, before it says that it did not happen."""
 

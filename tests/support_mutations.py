@@ -443,7 +443,7 @@ def forgets_what_is_in_flight(patch: Patch) -> type[SimRegistrar]:
 
 def overlooks_parts_in_flight(patch: Patch) -> type[SimRegistrar]:
     """What a callback's thread has just asked for is not known of when the resource ends, or a ring is looked for."""
-    for module in (releasing, loading):
+    for module in (releasing, load_rings):
         patch(module, "parts_of", lambda decision, resource_id: decision.catalog.parts_of(resource_id))
     return SimRegistrar
 

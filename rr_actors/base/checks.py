@@ -17,9 +17,9 @@ from msgspec import Struct
 from rr_actors.base.errors import (
     InvalidName,
     InvalidSpec,
+    MissingDependency,
     NotFound,
     RrError,
-    UsageError,
     exact_text,
     is_a,
     shown,
@@ -198,7 +198,7 @@ def needing(what: str, extra: str, instead: str = "") -> Generator[None]:
         instead: an alternative for the caller, for the error.
 
     Raises:
-        UsageError: a library is not installed; the text names the library and the extra.
+        MissingDependency: a library is not installed; the text names the library and the extra.
     """
     try:
         yield
@@ -215,20 +215,23 @@ EXTRAS = {
     "top": ("rich>=13.7", "typer>=0.20", "textual>=8.2"),
     "web": ("rich>=13.7", "typer>=0.20", "nicegui>=3.5"),
     "otel": ("opentelemetry-sdk>=1.27",),
+    "hosts": ("eclipse-zenoh>=1.10",),
     "temoto": ("rich>=13.7", "typer>=0.20", "pyyaml>=6.0"),
+    "check": ("hypothesis>=6.112",),
 }
 """What the extras of this package install, as in pyproject.toml."""
 
 
-def missing_library(library: str, what: str, extra: str, instead: str = "") -> UsageError:
+def missing_library(library: str, what: str, extra: str, instead: str = "") -> MissingDependency:
     """Return the error for a library that is not installed; the other arguments are those of needing().
 
     It names the libraries themselves, and not this package's extra: the package is on no index.
     """
     wanted = shlex.join(EXTRAS[extra])
-    install = f"pip install {wanted} (in a checkout of rr_actors: pip install '.[{extra}]'){instead}"
-    text = f"{what} needs the library {library}, which is not installed. Install it with: {install}"
-    return UsageError(text, library=library, extra=extra)
+    install = f"pip install {wanted}"
+    here = f"(in a checkout of rr_actors: pip install '.[{extra}]'){instead}"
+    text = f"{what} needs the library {library}, which is not installed. Install it with: {install} {here}"
+    return MissingDependency(text, module=library, install=install)
 
 
 # A check of messages. SupervisorCall is here, since actors, which lie below supervision, have to refuse it.

@@ -163,12 +163,15 @@ class SystemConfig:
     def from_toml(cls, path: str | os.PathLike[str]) -> Self:
         """Read a configuration from a TOML file; `[registrars.NAME]` configures one registrar.
 
+        Hosts.from_toml() reads the table [hosts] of the same file.
+
         Raises:
             ConfigError: the file cannot be read, is not TOML, or has an unknown key or a wrong value. `.file`, `.key`,
                 `.expected`, `.got`
         """
         file = file_name(path)
         table = read_toml(file)
+        table.pop("hosts", None)  # Hosts.from_toml() reads it
         registrars = table.pop("registrars", {})
         if not _is_table(registrars):
             raise wrong(file, "registrars", "tables [registrars.NAME]", registrars)

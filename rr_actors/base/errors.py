@@ -3,14 +3,16 @@
 "You misused this" (UsageError) stands apart from "the other side failed" (the rest)::
 
     RrError
-    ├─ UsageError           InvalidName NameTaken UnknownServer UnknownRegistrar UnknownQuery NotHolder InvalidRequest
-    │                       InvalidResponse InvalidSpec ConfigError NotSerializable AlreadyStarted AlreadyPresent
-    │                       NotFound ChildRunning ChildRestarting NotForDynamic TooManyChildren
+    ├─ UsageError           InvalidName NameTaken UnknownServer UnknownRegistrar UnknownHost NotExported UnknownQuery
+    │                       NotHolder NotAllowed InvalidRequest InvalidResponse InvalidSpec ConfigError NotSerializable
+    │                       MissingDependency
+    │                       AlreadyStarted AlreadyPresent NotFound ChildRunning ChildRestarting NotForDynamic
+    │                       TooManyChildren
     ├─ LoadError            LoadFailed(.trace) ─ CircularDependency(.ring), OverCapacity, ResourceBusy, GraphError;
-    │                       LoadTimeout
+    │                       LoadTimeout ─ HostUnreachable
     ├─ UnloadFailed(.trace)
     ├─ ResourceLost
-    ├─ Unavailable          RegistrarDown ActorUnavailable MailboxFull NotRunning
+    ├─ Unavailable          RegistrarDown ProtocolMismatch ActorUnavailable MailboxFull NotRunning
     ├─ CatalogError         CatalogLocked CatalogDamaged CatalogVersion
     └─ SupervisionError     StartFailed RestartIntensityExceeded
 
@@ -156,6 +158,17 @@ def with_article(noun: str) -> str:
     return f"{'an' if noun[:1].lower() in 'aeiou' else 'a'} {noun}"
 
 
+def counted(count: int, noun: str) -> str:
+    """Return "1 catalog", "0 queries", "2,000 processes": a number, and the noun in the form for it."""
+    return f"{count:,} {noun if count == 1 else _plural(noun)}"
+
+
+def _plural(noun: str) -> str:
+    if noun.endswith("y") and noun[-2:-1] not in "aeiou":
+        return f"{noun[:-1]}ies"
+    return f"{noun}es" if noun.endswith(("s", "x", "ch", "sh")) else f"{noun}s"
+
+
 def shortened(text: str) -> str:
     """Return the beginning of a user's text, such as an id, for a message: at most TEXT_LIMIT characters."""
     return text if len(text) <= TEXT_LIMIT else f"{text[: TEXT_LIMIT - 1]}…"
@@ -211,6 +224,21 @@ class UnknownRegistrar(UsageError, LookupError):
     known: tuple[str, ...] = ()
 
 
+class UnknownHost(UsageError, LookupError):
+    """No host of that name has been seen, or is named in the settings. `.host`, `.known`"""
+
+    host: str
+    known: tuple[str, ...] = ()
+
+
+class NotExported(UsageError, LookupError):
+    """The host does not let this one use that registrar. `.host`, `.registrar`, and the `.known` ones"""
+
+    host: str
+    registrar: str
+    known: tuple[str, ...] = ()
+
+
 class UnknownQuery(UsageError, LookupError):
     """The query or resource never existed, or is unloaded already. `.query_id`"""
 
@@ -223,6 +251,13 @@ class NotHolder(UsageError):
     query_id: str
     origin: str
     caller: str
+
+
+class NotAllowed(UsageError):
+    """A bridge of rr_actors.ros2 does not offer this server to nodes. `.server`; `.allowed`: what it offers"""
+
+    server: str
+    allowed: tuple[str, ...] = ()
 
 
 class InvalidRequest(UsageError, TypeError):
@@ -262,6 +297,13 @@ class NotSerializable(UsageError, TypeError):
     """A value cannot be sent. `.path` leads to the part that is the reason."""
 
     path: str
+
+
+class MissingDependency(UsageError, ImportError):
+    """A package that this part of rr_actors needs cannot be imported. `.module`; `.install`: how to get it"""
+
+    module: str
+    install: str
 
 
 class AlreadyStarted(UsageError):
@@ -370,11 +412,24 @@ class GraphError(LoadFailed, UsageError, ValueError):
 
 
 class LoadTimeout(LoadError, TimeoutError):
-    """No answer within the time limit; the load is withdrawn. `.server`, `.timeout_s`, the provider's `.status`"""
+    """No answer within the time limit; the load is withdrawn. `.server`, `.timeout_s`, the provider's `.status`
+
+    Of a load that waited in line for an exclusive resource: `.holder`, the registrar that had it, as its server said
+    last; "" if none did. `.since`: when that one asked for it, in seconds since 1970, or None.
+    """
 
     server: str
     timeout_s: float
     status: str = ""
+    holder: str = ""
+    since: float | None = None
+
+
+class HostUnreachable(LoadTimeout):
+    """The host was not reachable within the time limit; the load is withdrawn. `.host`; `.since_s`: how long so far"""
+
+    host: str
+    since_s: float
 
 
 class UnloadFailed(RrError):
@@ -416,6 +471,12 @@ class RegistrarDown(Unavailable):
 
     registrar: str
     status: str
+
+
+class ProtocolMismatch(Unavailable):
+    """The other host speaks another version of the protocol between hosts. `.host`"""
+
+    host: str
 
 
 class ActorUnavailable(Unavailable):

@@ -1,7 +1,8 @@
-"""Names: registrars, servers, server ids and child ids.
+"""Names: registrars, servers, server ids, child ids and hosts.
 
 A name has 1 to 64 ASCII letters, digits, "_", "-" and ".", and does not start with a dot: it is a directory's name too.
-A server id is "registrar/server"; a child's path in the tree is "root/inner/child".
+A server id is "registrar/server", or "host/registrar/server" for one of another host. A child's path in the tree is
+"root/inner/child".
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ _NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_\-.]{0,63}\Z")
 
 
 class ServerId(NamedTuple):
-    """A server's address: the registrar it belongs to and its name there."""
+    """A server's address: the registrar it belongs to ("cameras", or "hostb/cameras") and its name there."""
 
     registrar: str
     server: str
@@ -60,16 +61,29 @@ def check_name(name: object, what: str = "name") -> str:
 
 
 def parse_server_id(text: object) -> ServerId:
-    """Split "registrar/server" into its two names; raise InvalidName if the text is anything else."""
+    """Split "registrar/server", or "host/registrar/server", before the server's name.
+
+    Raises:
+        InvalidName: the text is anything else.
+    """
     if not is_a(text, str):
         raise InvalidName(
             f"server id: expected a string 'registrar/server', got {type(text).__name__} ({shown(text)})", name=text
         )
     text = exact_text(text)
-    registrar, slash, server = text.partition("/")
+    registrar, slash, server = text.rpartition("/")
     if not slash:
         raise InvalidName(f"server id {shown(text)}: expected 'registrar/server', got no '/'", name=text)
-    return ServerId(check_name(registrar, "registrar name"), check_name(server, "server name"))
+    check_registrar_name(registrar)
+    return ServerId(registrar, check_name(server, "server name"))
+
+
+def check_registrar_name(name: str) -> None:
+    """Raise InvalidName if this is neither "registrar" nor "host/registrar"."""
+    host, slash, registrar = name.rpartition("/")
+    if slash:
+        check_name(host, "host name")
+    check_name(registrar, "registrar name")
 
 
 parsed_server = functools.lru_cache(1024)(parse_server_id)
@@ -103,6 +117,8 @@ def no_child(name: str, paths: Collection[str]) -> NotFound:
 
 
 _MS_NS = 1_000_000
+_ID = re.compile(r"[0-9a-f]{12}[78][0-9a-f]{19}\Z")
+_EARLIEST_S = 1_600_000_000.0  # no id was made before; other ids may give any time
 _latest_ns = 0
 _numbers: itertools.count[int]  # next() is atomic: no lock, for which a finalizer or a signal handler would wait
 
@@ -138,6 +154,14 @@ def is_planned(id: str) -> bool:
 def made_at(id: str) -> float:
     """Return when an id was made here, in seconds since 1970. A resource's id begins with such a one."""
     return int(id[:12], 16) / 1000
+
+
+def time_in(id: str) -> float | None:
+    """Return when an id was made, in seconds since 1970; None for an id that is no UUIDv7 or planned_id()."""
+    if _ID.match(id) is None:
+        return None
+    at = made_at(id)
+    return at if at > _EARLIEST_S else None
 
 
 def _renew() -> None:

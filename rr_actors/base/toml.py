@@ -242,7 +242,8 @@ def _struct_in(kind: Any) -> Any:
 #     actor = "robots.arms:Arm"
 #     args = ["left"]
 #
-# Every other key is a field of the same name of ChildSpec, Supervisor or Backoff.
+# Every other key is a field of the same name of ChildSpec, Supervisor or Backoff. The table [hosts] is no part of the
+# tree: Hosts.from_toml() reads it from the same file.
 
 FilePath = str | os.PathLike[str]
 _ACTOR = "actor_class_or_manager"  # ChildSpec's field for the key `actor`
@@ -254,6 +255,7 @@ def read_supervisor(path: FilePath, supervisor: type[_T], child: type[Any], back
     """
     file = file_name(path)
     table = read_toml(file)
+    table.pop("hosts", None)  # Hosts.from_toml() reads it
     reader = _Reader(file, supervisor, child, backoff)
     reader.check_keys(supervisor, "", table)
     if "children" not in table:

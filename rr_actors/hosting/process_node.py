@@ -25,7 +25,7 @@ from rr_actors.hosting.run_files import RunKeeper, Watched
 from rr_actors.runtime.event_loop import Dispatcher, acquire, release
 from rr_actors.runtime.processes.process import Spawner
 from rr_actors.wire.local_transport import LocalTransport
-from rr_actors.wire.name_service import Directory, NameEntry, Presence, registrar_key
+from rr_actors.wire.name_service import Directory, NameEntry, OtherHosts, Presence, registrar_key
 from rr_actors.wire.transport import Attach, Hello, Welcome
 from rr_actors.wire.unix_transport import UnixTransport
 
@@ -46,6 +46,8 @@ class SystemInfo(msgspec.Struct, frozen=True):
     """The application's loggers' levels, by name, at the system's start. Children send up no record below them."""
     debug: bool = False
     """Whether actors can be paused."""
+    hosts: OtherHosts | None = None
+    """This host's name and its routes to others; None: the system ends at this host."""
 
 
 def _unheard(*_said: object) -> None:

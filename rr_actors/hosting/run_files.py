@@ -90,12 +90,13 @@ logger = Log("rr_actors")
 
 
 class RunKeeper:
-    """Looks after one process's names and socket, and the byte that all processes share. On the loop.
+    """Looks after one process's names and sockets, and the byte that all processes share. On the loop.
 
     It makes removed files again, logs that, and touches the others each hour.
 
     Attributes:
         also: further checks, which the loop calls; they must be quick.
+        transports: the transports with these sockets.
     """
 
     def __init__(
@@ -105,7 +106,7 @@ class RunKeeper:
         self._place = place
         self._is_there = True
         self._directory = directory
-        self._transport = transport
+        self.transports = [transport]
         self._watched = watched
         self._task: asyncio.Task[None] | None = None
 
@@ -163,5 +164,6 @@ class RunKeeper:
             )
 
     async def _restore_socket(self) -> None:
-        if await self._transport.keep():
-            logger.error("%s: the process's socket was removed, and is made again", self._transport.address)
+        for transport in self.transports:
+            if await transport.keep():
+                logger.error("%s: the process's socket was removed, and is made again", transport.address)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rr_actors.base.errors import GraphError, OverCapacity
+from rr_actors.base.errors import GraphError, MissingDependency, NotAllowed, OverCapacity
 from rr_actors.managers.actions.action import Action
 from rr_actors.managers.actions.action_manager import ActionEnd, Actions, RunAction, RunGraph
 from rr_actors.managers.actions.graph_pictures import draw_graph
@@ -43,6 +43,8 @@ __all__ = [
     "LoadComponent",
     "LoadRobot",
     "Measure",
+    "MissingDependency",
+    "NotAllowed",
     "OverCapacity",
     "Pipe",
     "Pipes",

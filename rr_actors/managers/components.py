@@ -45,10 +45,10 @@ from rr_actors.managers.planning.hedging import HEDGE_S
 from rr_actors.managers.planning.last_good import last_good_file, path_of
 from rr_actors.managers.planning.reliability import Reliabilities
 from rr_actors.managers.planning.retries import Retries
-from rr_actors.managers.planning.searches import Loading, Search, groups, release_soon, release_strays
+from rr_actors.managers.planning.searches import CandidateLoad, Search, groups, release_soon, release_strays
 from rr_actors.managers.program_conditions import ProgramHealth
 from rr_actors.managers.programs import RunProgram
-from rr_actors.managers.templates import Parameter, Parameters, check_unique, fill, fill_all
+from rr_actors.managers.templates import Parameter, Parameters, check_unique, fill, fill_all, with_parameters
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.manager import Beginning, Manager
 from rr_actors.registrar.model.rows import State
@@ -101,6 +101,9 @@ class LoadComponent(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     parameters: Parameters = {}
     instance: str = ""
 
+    def __rr_title__(self) -> str:
+        return with_parameters(self.type, self.parameters, self.instance)
+
 
 class Component(msgspec.Struct, frozen=True):
     """The response: the component that does the job, the pid of its program, and its parameters with filled templates.
@@ -114,10 +117,10 @@ class Component(msgspec.Struct, frozen=True):
     parameters: dict[str, str]
 
 
-class Start(NamedTuple):
+class ComponentStart(NamedTuple):
     """How to start a component for a request: its program, and what makes the response of that program's query."""
 
-    program: Loading
+    program: CandidateLoad
     made: Callable[[Query], Any]
 
 
@@ -233,7 +236,7 @@ class Components(Manager):
         status: Status,
         part: Query,
         fitting: Callable[[], Sequence[ComponentDescription]],
-        start: Callable[[ComponentDescription], Start],
+        start: Callable[[ComponentDescription], ComponentStart],
     ) -> None:
         """Blame what has failed, and put the first of those that fit in the place of its program.
 
@@ -335,12 +338,12 @@ class Components(Manager):
     def _reliabilities(self) -> Reliabilities:
         return Reliabilities(self.registrar.directory / "reliability.json")
 
-    def _start_of(self, request: LoadComponent, candidate: ComponentDescription) -> Start:
+    def _start_of(self, request: LoadComponent, candidate: ComponentDescription) -> ComponentStart:
         program, parameters = self._filled(candidate, request)
-        return Start(self._loading(program), functools.partial(component_of, candidate, parameters))
+        return ComponentStart(self._loading(program), functools.partial(component_of, candidate, parameters))
 
-    def _loading(self, program: RunProgram) -> Loading:
-        return Loading(self._programs, program, program.ready.timeout_s + LOAD_MARGIN_S)
+    def _loading(self, program: RunProgram) -> CandidateLoad:
+        return CandidateLoad(self._programs, program, program.ready.timeout_s + LOAD_MARGIN_S)
 
     def _component_of(self, request: LoadComponent, program: RunProgram) -> ComponentDescription | None:
         """Return the component that runs this program; None if the registry has changed since the program started."""

@@ -53,11 +53,11 @@ class ProgramFailed(RrError):
     `.wanted`: what the machine had no more of for it, "ENOSPC: ..."; "" if it failed for another reason.
     """
 
-    exit: Exit | None = None
+    exit: ProgramExit | None = None
     wanted: str = ""
 
 
-class Running(NamedTuple):
+class RunningProgram(NamedTuple):
     """A running program: its pid, and its start in seconds since boot. Together they always name one process."""
 
     pid: int
@@ -65,7 +65,7 @@ class Running(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Exit:
+class ProgramExit:
     """A program's exit code or signal (both None: no process saw the end), and the last lines of its output."""
 
     code: int | None
@@ -114,7 +114,7 @@ class ExternalPrograms:
     def __init__(
         self,
         directory: Path,
-        on_exit: Callable[[str, Exit], None],
+        on_exit: Callable[[str, ProgramExit], None],
         *,
         pauses: bool = False,
         groups: ControlGroups | None = None,
@@ -148,10 +148,10 @@ class ExternalPrograms:
         order: Order,
         *,
         attempt: int = 1,
-        missing: Callable[[Running], str] = lambda running: "",
+        missing: Callable[[RunningProgram], str] = lambda running: "",
         timeout_s: float = 10.0,
         is_unwanted: Callable[[], bool] = lambda: False,
-    ) -> Running:
+    ) -> RunningProgram:
         """Start a program, or take over the one that an interrupted start of this key left; return once it is ready.
 
         The program is ready when its output has had the order's `ready_line` and `missing(running)` returns "". Until
@@ -179,7 +179,7 @@ class ExternalPrograms:
             if spawned is not None:
                 spawned.close()
 
-    def attach(self, key: str) -> Running:
+    def attach(self, key: str) -> RunningProgram:
         """Watch a program that a predecessor started and that was ready.
 
         Raises:
@@ -248,7 +248,7 @@ class ExternalPrograms:
             _signal_all(shim, program, signal.SIGCONT)
 
     @contextlib.contextmanager
-    def _shim(self, key: str) -> Generator[tuple[ProcessHandle, Running]]:
+    def _shim(self, key: str) -> Generator[tuple[ProcessHandle, RunningProgram]]:
         """Yield the shim of a running program, and the program."""
         state = self._home(key).state()
         shim = shim_of(state)
@@ -358,11 +358,11 @@ class ExternalPrograms:
         self,
         home: Home,
         order: Order,
-        missing: Callable[[Running], str],
+        missing: Callable[[RunningProgram], str],
         timeout_s: float,
         spawned: ProcessHandle | None,
         is_unwanted: Callable[[], bool],
-    ) -> Running:
+    ) -> RunningProgram:
         limit = RunningLimit(timeout_s)
         asked: Future[str] | None = None
         command, seen = order.command, ""
@@ -429,12 +429,12 @@ class ExternalPrograms:
         self._on_exit(key, self._end_of(self._home(key)))
 
     @staticmethod
-    def _end_of(home: Home) -> Exit:
+    def _end_of(home: Home) -> ProgramExit:
         """Return how a program ended whose shim is gone; end the processes that a killed shim has left."""
         ended: dict[str, int] = home.state().get("ended", {})
         if not ended:
             kill_allocation(home.key)  # the program was killed with its shim, but its children were not
-        return Exit(ended.get("code"), ended.get("signal"), home.output(TAIL_LINES))
+        return ProgramExit(ended.get("code"), ended.get("signal"), home.output(TAIL_LINES))
 
     def _stop_shim(self, home: Home) -> None:
         """Ask the shim that holds the lock to end its program, and wait until the shim has ended."""
@@ -475,7 +475,7 @@ def _has_ended(shim: ProcessHandle, limit_s: float) -> bool:
     return True
 
 
-def _signal_all(shim: ProcessHandle, program: Running, number: int) -> None:
+def _signal_all(shim: ProcessHandle, program: RunningProgram, number: int) -> None:
     """Send a signal to the program's process group at once, and to each descendant outside of it.
 
     It looks again until there is no new one: a process that is not stopped yet may start another.
@@ -499,7 +499,7 @@ def _outside(shim: int, group: int) -> Iterator[psutil.Process]:
                     yield process
 
 
-def _ask(missing: Callable[[Running], str], running: Running) -> Future[str]:
+def _ask(missing: Callable[[RunningProgram], str], running: RunningProgram) -> Future[str]:
     """Call missing(running) in a thread of its own, in the caller's context: it may be a user's probe, and hang."""
     answer: Future[str] = Future()
 
@@ -513,6 +513,6 @@ def _ask(missing: Callable[[Running], str], running: Running) -> Future[str]:
     return answer
 
 
-def _running(state: dict[str, Any]) -> Running:
+def _running(state: dict[str, Any]) -> RunningProgram:
     pid, ticks = state["program"]
-    return Running(pid, ticks / os.sysconf("SC_CLK_TCK"))
+    return RunningProgram(pid, ticks / os.sysconf("SC_CLK_TCK"))

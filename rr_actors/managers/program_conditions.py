@@ -18,13 +18,13 @@ import msgspec
 
 from rr_actors.base.checks import check_number, invalid
 from rr_actors.base.errors import InvalidRequest, is_a, shown, text_of
-from rr_actors.managers.external_programs import Running
+from rr_actors.managers.external_programs import RunningProgram
 from rr_actors.registrar.model.health import LONGEST_S, SHORTEST_S, Health, check_count
 from rr_actors.runtime.time_limits import RunningLimit, RunningTime
 
 Probe = Callable[[int], bool]
 """A user's function: it gets the pid of a program, and returns whether the program is ready, or well."""
-Condition = Callable[[Running], str]
+Condition = Callable[[RunningProgram], str]
 """Returns what is seen instead of what is expected; "" if it holds."""
 
 _CONNECT_LIMIT_S = 0.2
@@ -35,7 +35,7 @@ _OF_TIMEOUT = 0.5  # of a check's time limit, for a connection: then its own wor
 _CLOCK_SLACK_S = 0.05  # a process's start is known to 10 ms, a file's time to one tick of the kernel
 
 
-def what_is_missing(conditions: Iterable[Condition], running: Running) -> str:
+def what_is_missing(conditions: Iterable[Condition], running: RunningProgram) -> str:
     """Return what is seen of all conditions that do not hold; "" if each holds."""
     return "; ".join(filter(None, [condition(running) for condition in conditions]))
 
@@ -49,7 +49,7 @@ def file_is_written(path: Path, *, repeated: bool) -> Condition:
     """
     before = look_of(path)
 
-    def condition(running: Running) -> str:
+    def condition(running: RunningProgram) -> str:
         found = look_of(path)
         if found is None:
             return f"file {path}: not there"
@@ -60,7 +60,7 @@ def file_is_written(path: Path, *, repeated: bool) -> Condition:
     return condition
 
 
-def _is_of(found: tuple[int, ...], running: Running) -> bool:
+def _is_of(found: tuple[int, ...], running: RunningProgram) -> bool:
     started = time.time() - (time.clock_gettime(time.CLOCK_BOOTTIME) - running.start_time)
     return found[-1] / 1e9 >= started - _CLOCK_SLACK_S
 
@@ -93,7 +93,7 @@ class OutputGoesOn:
         self._seen, self._looked_at = look_of(self._file), self._ran.read()
         self._written_at = self._looked_at
 
-    def __call__(self, running: Running) -> str:
+    def __call__(self, running: RunningProgram) -> str:
         found, now = look_of(self._file), self._ran.read()
         passed_s, self._looked_at = now - self._looked_at, now
         if found is not None and found != self._seen:
@@ -108,7 +108,7 @@ def port_accepts(host: str, port: int) -> Condition:
     return functools.partial(_accepts, host, port)
 
 
-def _accepts(host: str, port: int, running: Running) -> str:
+def _accepts(host: str, port: int, running: RunningProgram) -> str:
     try:
         socket.create_connection((host, port), _CONNECT_LIMIT_S).close()
     except OSError as error:
@@ -151,7 +151,7 @@ def _serves(
     what: str,
     is_kept: Callable[[socket.socket], bool],
     limit_s: float,
-    running: Running,
+    running: RunningProgram,
 ) -> str:
     limit = RunningLimit(limit_s)
     try:
@@ -200,7 +200,7 @@ def probe_agrees(name: str, probes: Mapping[str, Probe], path: str) -> Condition
     """
     probe = probes.get(name) or _import(name, path)
 
-    def condition(running: Running) -> str:
+    def condition(running: RunningProgram) -> str:
         said = probe(running.pid)
         return "" if said else f"probe {name}: it returned {shown(said)}"
 
@@ -282,7 +282,7 @@ class ProgramCheck:
             self._goes_on = OutputGoesOn(output, wanted.line_every_s, wanted.every_s)
         self._conditions = [*_conditions(wanted, probes)]
 
-    def seen(self, running: Running) -> str:
+    def seen(self, running: RunningProgram) -> str:
         """Return what is seen instead of what is expected; "" if the program is well."""
         goes_on = [] if self._goes_on is None else [self._goes_on]
         return what_is_missing([*goes_on, *self._conditions], running)

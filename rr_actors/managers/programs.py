@@ -10,6 +10,7 @@ import contextlib
 import functools
 import os
 import re
+import shlex
 import signal
 import threading
 from collections.abc import Mapping
@@ -22,7 +23,14 @@ from msgspec.structs import replace
 from rr_actors.base.errors import CatalogError, InvalidRequest, NotFound, RrError, UsageError, shown
 from rr_actors.base.names import check_name
 from rr_actors.base.reporting.log import Log
-from rr_actors.managers.external_programs import LONGEST_S, Exit, ExternalPrograms, Order, Running, with_output
+from rr_actors.managers.external_programs import (
+    LONGEST_S,
+    ExternalPrograms,
+    Order,
+    ProgramExit,
+    RunningProgram,
+    with_output,
+)
 from rr_actors.managers.program_conditions import (
     Condition,
     Probe,
@@ -98,6 +106,10 @@ class RunProgram(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     instance: str = ""
     cost: dict[str, float] = {}
     health: ProgramHealth | None = None
+
+    def __rr_title__(self) -> str:
+        called = shlex.join([self.command.rpartition("/")[2] or self.command, *self.arguments])
+        return f"{called} ({self.instance})" if self.instance else called
 
 
 def _cost(request: RunProgram) -> dict[str, float]:
@@ -226,7 +238,7 @@ class Programs(Manager):
         """Return what is seen of a program that is not as its health expects."""
         id = current().resource_id
         check = self._checks.get(id)
-        seen = "" if check is None else check.seen(Running(response.pid, response.start_time))
+        seen = "" if check is None else check.seen(RunningProgram(response.pid, response.start_time))
         return Status(State.ERROR, with_output(seen, self._external.last_output(id))) if seen else None
 
     @run_program.status
@@ -274,7 +286,7 @@ class Programs(Manager):
     def _beside(self) -> Path:
         return self.registrar.directory / "programs"
 
-    def _program_ended(self, resource_id: str, end: Exit) -> None:
+    def _program_ended(self, resource_id: str, end: ProgramExit) -> None:
         """Send the holders of a program that has ended unasked a FATAL status, on a full disk when it has room."""
         status = Status(State.FATAL, f"the program {end}")
         try:

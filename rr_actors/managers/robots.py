@@ -24,8 +24,8 @@ from rr_actors.managers.planning.blame import is_own_failure, part_of
 from rr_actors.managers.planning.hedging import HEDGE_S
 from rr_actors.managers.planning.last_good import last_good_file, path_of
 from rr_actors.managers.planning.retries import Retries
-from rr_actors.managers.planning.searches import Loading, Search, release_soon, release_strays
-from rr_actors.managers.templates import Parameter, Parameters, check_unique, fill_all
+from rr_actors.managers.planning.searches import CandidateLoad, Search, release_soon, release_strays
+from rr_actors.managers.templates import Parameter, Parameters, check_unique, fill_all, with_parameters
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.manager import Beginning, Manager
 from rr_actors.registrar.model.rows import State
@@ -37,7 +37,7 @@ logger = Log("rr_actors.managers.robots")
 _LOAD_LIMIT_S = 60.0
 
 
-class Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class RobotPart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A part of a robot: a component of this type, with these parameters besides those of the request."""
 
     type: str
@@ -48,11 +48,11 @@ class RobotDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One robot as the file describes it."""
 
     name: str
-    driver: Part
-    controller: Part | None = None
-    sensors: list[Part] = []
+    driver: RobotPart
+    controller: RobotPart | None = None
+    sensors: list[RobotPart] = []
 
-    def parts(self) -> list[Part]:
+    def parts(self) -> list[RobotPart]:
         """Return all parts, in the order in which they are loaded."""
         return [self.driver, *([self.controller] if self.controller else []), *self.sensors]
 
@@ -68,6 +68,9 @@ class LoadRobot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     name: str
     parameters: Parameters = {}
+
+    def __rr_title__(self) -> str:
+        return with_parameters(self.name, self.parameters)
 
 
 class Robot(msgspec.Struct, frozen=True):
@@ -157,7 +160,7 @@ class Robots(Manager):
             text=lambda said: f"{said}: {status.message}",
         )
 
-        load = Loading(failed.server_id, failed.request, _LOAD_LIMIT_S)
+        load = CandidateLoad(failed.server_id, failed.request, _LOAD_LIMIT_S)
 
         def made(spare: Query) -> Robot:
             return self._assembled(request, self._in_order(request, [*others, spare]))

@@ -13,6 +13,13 @@ Parameter = str | int | float | bool
 Parameters = Mapping[str, Parameter]
 
 
+def with_parameters(name: str, parameters: Parameters, instance: str = "") -> str:
+    """Return the title of a request: "camera (device=/dev/video0; left)"."""
+    given = ", ".join(f"{key}={plain(value)}" for key, value in parameters.items())
+    said = "; ".join(filter(None, (given, instance)))
+    return f"{name} ({said})" if said else name
+
+
 def check_unique(path: Path, table: str, names: Sequence[str]) -> None:
     """Check that each entry of `[[table]]` has a name, and that no two have the same.
 

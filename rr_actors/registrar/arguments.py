@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import FunctionType, MethodType
-from typing import Any, TypedDict, TypeVar, cast
+from typing import Any, TypedDict, TypeVar, Unpack, cast
 
 import msgspec
 
@@ -50,11 +50,13 @@ def server_target(server: object, node: Node) -> ServerId:
     Raises:
         InvalidName: `server` is neither; for a name without a registrar the text has the id that was probably meant.
         UnknownRegistrar, UsageError: none or several of the system's children have the declaring class.
+        UnknownHost, NotExported, ProtocolMismatch: the server is of another host, which is unknown or refuses it.
     """
     if is_a(server, Declared):
         return parse_server(declaring(cast("Declared[Any, Any, Any]", server)).id_in(node.directory))
     try:
-        return parse_server(server)
+        parsed = parse_server(server)
+        return parsed if node.info.hosts is None else node.info.hosts.provider(parsed, node.directory)
     except InvalidName as error:
         text = error.message
         if is_a(server, (FunctionType, MethodType)):
@@ -196,37 +198,42 @@ DEFAULTS = LoadOptions()
 """The options of a call that gives none."""
 
 
-def checked(
-    called: str, given: GroupKeywords, response_type: Any = None, names: type[GroupKeywords] = LoadKeywords
-) -> LoadOptions:
-    """Return the options that a caller has given.
-
-    Args:
-        called: the method, for the text of errors.
-        names: the keywords that the method takes.
+def checked(called: str, response_type: Any = None, /, **given: Unpack[LoadKeywords]) -> LoadOptions:
+    """Return the options that a caller has given to the method `called`.
 
     Raises:
         TypeError: the method takes no such keyword.
         UsageError, NotSerializable: the value of an option is wrong.
     """
-    options = cast("LoadKeywords", given)  # this call's own dict
-    for name in options.keys() - names.__annotations__.keys():
-        hint = did_you_mean(name, names.__annotations__)
-        raise TypeError(f"Registrar.{called}() got an unexpected keyword argument {name!r}{hint}")
-    if "timeout_s" in options:
-        options["timeout_s"] = time_limit(options["timeout_s"])
-    if "wait_s" in options:
-        options["wait_s"] = _checked_wait(options["wait_s"], called)
+    check_keywords(called, given, LoadKeywords)
+    if "timeout_s" in given:
+        given["timeout_s"] = time_limit(given["timeout_s"])
+    if "wait_s" in given:
+        given["wait_s"] = _checked_wait(given["wait_s"], called)
     codec = None if response_type is None else codec_for(response_type)
-    on_status = options.get("on_status")
+    on_status = given.get("on_status")
     status_callback(on_status, called.removesuffix("_async"))
     loop: CallersLoop | None = None
     if called.endswith("_async"):
         check_asyncio(called)
         loop = callers_loop(on_status)
-    if "priority" in options:
-        options["priority"] = checked_priority(options["priority"], called)
-    return LoadOptions(**options, own="priority" in options, codec=codec, loop=loop)
+    if "priority" in given:
+        given["priority"] = checked_priority(given["priority"], called)
+    return LoadOptions(**given, own="priority" in given, codec=codec, loop=loop)
+
+
+def passed_on(**options: Unpack[LoadKeywords]) -> Any:
+    """Return the options, checked. Of a function that passes its own on, Jedi shows them by their names."""
+    return checked("load", **options)
+
+
+def check_keywords(called: str, given: Mapping[str, object], names: type[GroupKeywords]) -> None:
+    """Raise TypeError if the method `called` does not take a keyword that its caller has given."""
+    known = names.__annotations__
+    for name in given:
+        if name not in known:
+            hint = did_you_mean(name, known)
+            raise TypeError(f"Registrar.{called}() got an unexpected keyword argument {name!r}{hint}")
 
 
 def _checked_wait(value: object, called: str) -> float | None:

@@ -6,7 +6,7 @@ import copy
 import functools
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from types import FunctionType
-from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeVar, cast, overload
+from typing import Any, Generic, Literal, NamedTuple, Protocol, Self, TypeVar, cast, overload
 
 from msgspec.structs import replace
 
@@ -23,7 +23,9 @@ from rr_actors.registrar.engine.server import (
     checked_whole,
 )
 from rr_actors.registrar.model.health import Health
-from rr_actors.registrar.model.roles import ROLES
+from rr_actors.registrar.model.roles import LOAD, ROLES, Role
+from rr_actors.registrar.model.rows import State
+from rr_actors.registrar.queries import Status
 from rr_actors.registrar.servers.callback_context import current
 from rr_actors.runtime.workers import is_async
 from rr_actors.wire.name_service import Directory, Presence, registrar_key
@@ -31,8 +33,13 @@ from rr_actors.wire.name_service import Directory, Presence, registrar_key
 Request = TypeVar("Request")
 Returned = TypeVar("Returned")
 Response = TypeVar("Response")
+End = TypeVar("End")
 F = TypeVar("F", bound=Callable[..., Any])
 
+_Fields = Mapping[str, object]
+"""The request of a server whose load callback takes its fields."""
+_Numbers = Mapping[str, float]
+_Found = State | Status | None
 Cost = Mapping[str, float] | Callable[..., Mapping[str, float]]
 
 _SHARE_S = 60.0  # for a share of a server without a load_timeout_s
@@ -79,6 +86,7 @@ class server:  # noqa: N801 - used as a decorator
         at_once: int | None = None,
         exclusive: bool = False,
         grace_s: float | None = None,
+        title: Callable[..., str] | None = None,
         cost: Cost | None = None,
         cost_from: str = "budgets",
         request_type: Any = None,
@@ -90,7 +98,7 @@ class server:  # noqa: N801 - used as a decorator
         callbacks, types = (_nothing, None, None, None), (request_type, response_type)
         limits = linger_s, load_timeout_s, recovery, recover_timeout_s
         spec = ServerSpec(name, *callbacks, *types, *limits, idle=idle, paused_s=paused_s, health=health)
-        spec = replace(spec, exclusive=exclusive, grace_s=grace_s)
+        spec = replace(spec, exclusive=exclusive, grace_s=grace_s, title=title)
         self._spec = checked_spec(replace(spec, provides=provides, at_once=at_once))
         self._cost = None if cost is None else _Cost(self._spec, cost, check_name(cost_from, "cost_from"))
 
@@ -98,11 +106,11 @@ class server:  # noqa: N801 - used as a decorator
     @overload
     def __call__(  # pyright: ignore[reportOverlappingOverload]
         self, load: Callable[[Any, Any, Any], Coroutine[Any, Any, Response]]
-    ) -> Declared[Mapping[str, object], Coroutine[Any, Any, Response], Response]: ...
+    ) -> Declared[_Fields, Coroutine[Any, Any, Response], Response]: ...
     @overload
     def __call__(  # pyright: ignore[reportOverlappingOverload]
         self, load: Callable[[Any, Any, Any], Response]
-    ) -> Declared[Mapping[str, object], Response, Response]: ...
+    ) -> Declared[_Fields, Response, Response]: ...
     @overload
     def __call__(  # pyright: ignore[reportOverlappingOverload]
         self, load: Callable[[Any, Request], Coroutine[Any, Any, Response]]
@@ -114,11 +122,11 @@ class server:  # noqa: N801 - used as a decorator
     @overload
     def __call__(  # pyright: ignore[reportOverlappingOverload]
         self, load: Callable[..., Coroutine[Any, Any, Response]]
-    ) -> Declared[Mapping[str, object], Coroutine[Any, Any, Response], Response]: ...
+    ) -> Declared[_Fields, Coroutine[Any, Any, Response], Response]: ...
     @overload
     def __call__(  # pyright: ignore[reportOverlappingOverload]
         self, load: Callable[..., Response]
-    ) -> Declared[Mapping[str, object], Response, Response]: ...
+    ) -> Declared[_Fields, Response, Response]: ...
     def __call__(self, load: Callable[..., Any]) -> Declared[Any, Any, Any]:
         """Return the declaration of the server whose load callback is the decorated method.
 
@@ -142,6 +150,7 @@ class Declared(Generic[Request, Returned, Response]):
 
     def __init__(self, spec: ServerSpec, load: Callable[..., Any], cost: _Cost | None) -> None:
         with examined(f"@rr.server({spec.name!r})"):
+            _check_self(load, LOAD, f"@rr.server({spec.name!r})")
             functools.update_wrapper(cast("Callable[..., Any]", self), load)
         self._load = load
         self._cost = cost
@@ -157,15 +166,36 @@ class Declared(Generic[Request, Returned, Response]):
         """The server's name."""
         return self._spec.name
 
-    def unload(self, callback: F) -> F:
+    # Of each callback type checkers know what it takes and returns. The first overload is that of a load callback with
+    # several parameters, or none: what the others take then has no type.
+
+    @overload
+    def unload(self: Declared[_Fields, Any, Any], callback: F) -> F: ...
+    @overload
+    def unload(self, callback: Callable[[Any, Request, Response], End]) -> Callable[[Any, Request, Response], End]: ...
+    def unload(self, callback: Callable[..., Any]) -> Callable[..., Any]:
         """Declare a method as the unload callback: ``(self, request, response)``."""
         return self._take("unload", callback)
 
-    def status(self, callback: F) -> F:
+    @overload
+    def status(self: Declared[_Fields, Any, Any], callback: F) -> F: ...
+    @overload
+    def status(self, callback: Callable[[Any, Request, Status], End]) -> Callable[[Any, Request, Status], End]: ...
+    def status(self, callback: Callable[..., Any]) -> Callable[..., Any]:
         """Declare a method as the status callback: ``(self, request, status)``."""
         return self._take("status", callback)
 
-    def recover(self, callback: F) -> F:
+    @overload
+    def recover(self: Declared[_Fields, Any, Any], callback: F) -> F: ...
+    @overload
+    def recover(
+        self, callback: Callable[[Any, Request, Response], Coroutine[Any, Any, Response]]
+    ) -> Callable[[Any, Request, Response], Coroutine[Any, Any, Response]]: ...
+    @overload
+    def recover(
+        self, callback: Callable[[Any, Request, Response], Response]
+    ) -> Callable[[Any, Request, Response], Response]: ...
+    def recover(self, callback: Callable[..., Any]) -> Callable[..., Any]:
         """Declare a method as the recover callback: ``(self, request, response) -> response``."""
         return self._take("recover", callback)
 
@@ -177,7 +207,17 @@ class Declared(Generic[Request, Returned, Response]):
         """
         return self._take("upgrade", callback)
 
-    def usage(self, callback: F) -> F:
+    @overload
+    def usage(self: Declared[_Fields, Any, Any], callback: F) -> F: ...
+    @overload
+    def usage(
+        self, callback: Callable[[Any, Request, Response], Coroutine[Any, Any, _Numbers]]
+    ) -> Callable[[Any, Request, Response], Coroutine[Any, Any, _Numbers]]: ...
+    @overload
+    def usage(
+        self, callback: Callable[[Any, Request, Response], _Numbers]
+    ) -> Callable[[Any, Request, Response], _Numbers]: ...
+    def usage(self, callback: Callable[..., Any]) -> Callable[..., Any]:
         """Declare a method that returns what a resource uses now: ``(self, request, response) -> dict[str, float]``.
 
         Registrar.usage() runs it for each loaded resource. The names and units of the numbers are free; "cpu_s", "cpu",
@@ -185,18 +225,42 @@ class Declared(Generic[Request, Returned, Response]):
         """
         return self._take("usage", callback)
 
-    def health(self, callback: F) -> F:
+    @overload
+    def health(self: Declared[_Fields, Any, Any], callback: F) -> F: ...
+    @overload
+    def health(
+        self, callback: Callable[[Any, Request, Response], Coroutine[Any, Any, _Found]]
+    ) -> Callable[[Any, Request, Response], Coroutine[Any, Any, _Found]]: ...
+    @overload
+    def health(
+        self, callback: Callable[[Any, Request, Response], _Found]
+    ) -> Callable[[Any, Request, Response], _Found]: ...
+    def health(self, callback: Callable[..., Any]) -> Callable[..., Any]:
         """Declare a method that says how well a resource is: ``(self, request, response)``. For health=rr.Health(...).
 
         It returns None (well), a State, or a Status with a text; or it raises. See docs/planning.md, "Health".
         """
         return self._take("probe", callback)
 
-    def pause(self, callback: F) -> F:
+    @overload
+    def pause(self: Declared[_Fields, Any, Any], callback: F) -> F: ...
+    @overload
+    def pause(self, callback: Callable[[Any, Request, Response], End]) -> Callable[[Any, Request, Response], End]: ...
+    def pause(self, callback: Callable[..., Any]) -> Callable[..., Any]:
         """Declare a method that pauses an idle resource: ``(self, request, response)``. For idle="pause"."""
         return self._take("pause", callback)
 
-    def resume(self, callback: F) -> F:
+    @overload
+    def resume(self: Declared[_Fields, Any, Any], callback: F) -> F: ...
+    @overload
+    def resume(
+        self, callback: Callable[[Any, Request, Response], Coroutine[Any, Any, Response | None]]
+    ) -> Callable[[Any, Request, Response], Coroutine[Any, Any, Response | None]]: ...
+    @overload
+    def resume(
+        self, callback: Callable[[Any, Request, Response], Response | None]
+    ) -> Callable[[Any, Request, Response], Response | None]: ...
+    def resume(self, callback: Callable[..., Any]) -> Callable[..., Any]:
         """Declare a method that resumes a paused resource: ``(self, request, response)``.
 
         It may return a new response. If it raises, the resource is lost: its holders hear FATAL.
@@ -212,6 +276,7 @@ class Declared(Generic[Request, Returned, Response]):
                 expected = f"a method of another name than {name!r}, the load callback, which it would replace"
                 text = f"server {self.name!r}: {role}: expected {expected}"
                 raise InvalidSpec(text, field=role, expected=expected, got=name)
+            _check_self(callback, ROLES[role], f"server {self.name!r}")
             checked_callback(_without_self(callback), ROLES[role], self._spec.request_type, f"server {self.name!r}")
             self._others[role] = callback
             return callback
@@ -245,7 +310,7 @@ class Declared(Generic[Request, Returned, Response]):
         """Return the names of the methods that are its callbacks."""
         return {self._load.__name__, *(callback.__name__ for callback in self._others.values())}
 
-    def _declaring(self) -> Declaring:
+    def _declaring(self) -> DeclaringClass:
         """Return which class declares the server.
 
         Raises:
@@ -254,10 +319,10 @@ class Declared(Generic[Request, Returned, Response]):
         if self._owner is None:
             raise UsageError(f"server {self.name!r}: expected an attribute of a Manager class, got a function")
         warn_of_redefined(self._owner)
-        return Declaring(class_name(self._owner), self._load.__name__, self.name)
+        return DeclaringClass(class_name(self._owner), self._load.__name__, self.name)
 
 
-class Declaring(NamedTuple):
+class DeclaringClass(NamedTuple):
     """A class of managers, as the directory of names has it, one of its methods, and the server that this declares."""
 
     owner: str
@@ -385,6 +450,27 @@ def _bound(manager: object, callback: Callable[..., Any]) -> Callable[..., Any]:
     found = getattr(type(manager), callback.__name__, None)
     method = found if callable(found) and not isinstance(found, Declared) else callback
     return functools.partial(method, manager)
+
+
+def _check_self(callback: Callable[..., Any], role: Role, who: str) -> None:
+    """Refuse a method whose first parameter is not the manager.
+
+    The name `self` is always right. Another name is wrong if it is that of an argument, or if it has the annotation of
+    a request. A manager has none, or its own class.
+
+    Raises:
+        InvalidSpec: `self` is forgotten.
+    """
+    if not is_a(callback, FunctionType) or not callback.__code__.co_argcount:
+        return  # a function without parameters is refused with its signature
+    first = callback.__code__.co_varnames[0]
+    annotation = callback.__annotations__.get(first)
+    owner = callback.__qualname__.rpartition(".")[0].rpartition(".")[2]
+    is_manager = annotation is None or is_a(annotation, TypeVar) or annotation is Self or annotation in (owner, "Self")
+    if first != "self" and (first in role.arguments or not is_manager):
+        expected = f"self as the first parameter: {callback.__name__}(self, {first}, ...)"
+        text = f"{who}: {role.option}: expected {expected}, got {callback.__name__}({first}, ...)"
+        raise InvalidSpec(text, field=role.option, expected=expected, got=callback)
 
 
 def _without_self(load: Callable[..., Any]) -> Callable[..., Any]:

@@ -339,9 +339,13 @@ class Loading(InFlight[Query]):
         super().__init__()
         self._loads, self._limits, self.query = loads, loads.limits, query
         self.limit_s, self.timeout_s = limit_s, timeout_s  # the second as the caller gave it
+        if query.parent:
+            loads.actor.part_times.began(query.parent)
 
     def ended(self, held: Held | None, error: RrError | None) -> None:
         """Note how the load has ended. On the loop."""
+        if self.query.parent:
+            self._loads.actor.part_times.ended(self.query.parent)
         if error is None and held is not None:
             loaded(self.query, held)
         else:
@@ -418,6 +422,8 @@ class Loads:
         starts = not self.actor.serving and ask_cycles.starting() is not None
         if starts:
             self._starting.add(query.id)
+        if parent:
+            self.actor.part_times.began(parent)
         try:
             self._listen(query, options)
             with LettingIn():
@@ -431,7 +437,10 @@ class Loads:
             self.withdraw(query)
             raise
         finally:
+            if parent:
+                self.actor.part_times.ended(parent)
             self.actor.catalog.wait_limits.pop(query.id, None)
+            self.actor.listeners.places.pop(query.id, None)
             if starts:
                 self._starting.discard(query.id)
         return query
@@ -448,6 +457,8 @@ class Loads:
         starts = not self.actor.serving and ask_cycles.starting() is not None
         if starts:
             self._starting.add(query.id)
+        if parent:
+            self.actor.part_times.began(parent)
         try:
             self._listen(query, options)
             if hearer is not None:
@@ -461,7 +472,10 @@ class Loads:
             self.withdraw(query)
             raise
         finally:
+            if parent:
+                self.actor.part_times.ended(parent)
             self.actor.catalog.wait_limits.pop(query.id, None)
+            self.actor.listeners.places.pop(query.id, None)
             if starts:
                 self._starting.discard(query.id)
             if hearer is not None:
@@ -742,23 +756,36 @@ def _rank(options: LoadOptions) -> int:
 def _too_late(actor: RegistrarActor, query: Query, timeout_s: float | None) -> Failure:
     """Return the failure of a load that has taken too long. Its text says what the provider seems to be doing."""
     server = f"{query.registrar}/{query.server}"
-    status, doing = _doing(actor, query.registrar, "load callback, or an unload for which it waits,")
+    place = actor.listeners.places.get(query.id)
+    if place is None:
+        does = _CALLBACK.format("load callback, or an unload for which it waits,")
+    else:
+        ago = "" if place.since is None else f" (asked for it {max(0.0, time.time() - place.since):.3g} s ago)"
+        does = f"and has said last that the load is {place.text}{ago}"
+    status, doing = _doing(actor, query.registrar, does)
     text = f"{server}: not loaded within {timeout_s:g} s; {query.registrar} is {doing}; the load is withdrawn"
-    return Failure("LoadTimeout", text, {"server": server, "timeout_s": timeout_s, "status": str(status)})
+    details: dict[str, Any] = {"server": server, "timeout_s": timeout_s, "status": str(status)}
+    if place is not None:
+        details |= {"holder": place.holder, "since": place.since}
+    hosts = actor.node.info.hosts
+    if hosts is not None and (away := hosts.unreachable(actor.node.directory, query.registrar)) is not None:
+        return Failure("HostUnreachable", text, details | {"host": away.name, "since_s": time.time() - away.since})
+    return Failure("LoadTimeout", text, details)
 
 
-def _doing(actor: RegistrarActor, provider: str, callback: str) -> tuple[Presence, str]:
+_CALLBACK = "its {} has not returned yet, or what it returned is not on disk yet"
+
+
+def _doing(actor: RegistrarActor, provider: str, does: str) -> tuple[Presence, str]:
     """Return the directory's status of a provider that has not answered, and words for the status.
 
-    `callback` names the callbacks for which a provider that is up may keep the caller waiting.
+    `does` says for what a provider that is up may keep the caller waiting.
     """
     entry = actor.node.find(provider)
     if entry is None:
         return Presence.GONE, _DOING[Presence.GONE]
     if entry.status is Presence.UP:
-        if why := paused(entry.address):
-            return Presence.UP, why
-        return Presence.UP, f"up, its {callback} has not returned yet, or what it returned is not on disk yet"
+        return Presence.UP, paused(entry.address) or f"up, {does}"
     return entry.status, f"{_DOING[entry.status]}{entry.because}"
 
 
@@ -1096,7 +1123,7 @@ class Unloads:
         if actor.closed or held is None:
             return
         provider = repr(held.registrar)
-        status, doing = _doing(actor, held.registrar, "unload callback, or one before it,")
+        status, doing = _doing(actor, held.registrar, _CALLBACK.format("unload callback, or one before it,"))
         text = (
             f"query {query_id}: {provider} did not answer within {timeout_s:g} s; the release is owed and will be sent"
         )

@@ -16,23 +16,25 @@ from functools import partial
 from typing import Literal, TypeVar
 
 import msgspec
+from msgspec.structs import replace
 
 from rr_actors.base.names import named
 from rr_actors.base.values.canonical import json_of, shown_plain, text_of_value
 from rr_actors.registrar.core.callback_runs import run_id
+from rr_actors.registrar.core.foretelling import End, foretell_restart, foretell_statuses, known_of
 from rr_actors.registrar.core.loads.loading import is_reloaded
 from rr_actors.registrar.engine.progress import shown_progress
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog
-from rr_actors.registrar.model.rows import STANDBY, Held, Hold, Phase, Resource, priority_of
+from rr_actors.registrar.model.rows import STANDBY, Held, Hold, Notice, Phase, Resource, State, priority_of
 from rr_actors.streams.stream import StreamRow
 
 HOLDERS_SHOWN = 20
 """How many holders, and how many dependencies, a resource's row lists at most. It also has their total numbers."""
 _PART = 4  # characters that a search for the beginning or end of an id needs
 _FOUND = 20
-_AT_ONCE = 500  # rows of which the neighbours are read while the lock is held
+_AT_ONCE = 200  # rows of which the neighbours are read while the lock is held
 _RUN = 5000  # names that are sorted by one call of C, which lets no other thread run
 
 _VALUE = re.compile(r"""["'{}()\[\],:\\]|\A[-+.\deE]+\Z""")  # JSON or Python punctuation, or a number
@@ -46,6 +48,8 @@ CONDITIONS = (
 RELOADING = "reloading"
 """The phase, for people, of a resource that is loaded again on demand."""
 
+_STATES = frozenset(str(state).lower() for state in State)
+_TROUBLE = frozenset((State.WARNING, State.ERROR, State.FATAL))
 _TAKEN = frozenset(("loaded", "pausing", "paused", "resuming"))  # phases of which a revocation says more
 
 _Row = TypeVar("_Row", Resource, Held)
@@ -53,7 +57,7 @@ _Found = TypeVar("_Found")
 _Sorted = TypeVar("_Sorted")
 
 
-What = Literal["resources", "queries", "id", "servers", "loads", "streams", "response"]
+What = Literal["resources", "queries", "id", "servers", "loads", "streams", "response", "titles", "foretold"]
 
 
 class Wanted(msgspec.Struct, frozen=True):
@@ -62,11 +66,15 @@ class Wanted(msgspec.Struct, frozen=True):
     Responses are not searched. With "id", the rows of the resource and the query with this id, or with
     this beginning or end of an id. With "servers", all servers with their counts. With "loads", how often and how long
     loads of each server wait, and the queries whose loads wait now. With "streams", the open streams. With "response",
-    the whole response of the resource with this id.
+    the whole response of the resource with this id. With "foretold", what the registrar would do.
 
     Attributes:
-        sort: one of RESOURCE_ORDERS or STREAM_ORDERS; among equals, and with "", rows are as the registrar has them.
+        sort: one of RESOURCE_ORDERS or STREAM_ORDERS, or "trouble": those first where it began, the worst
+            first; among equals, and with "", rows are as the registrar has them.
         states, holder: only resources in one of these states, in small letters, and with a holder of this name.
+        ids: with "titles": of queries that are served here.
+        end: with "foretold": after its process has ended so, and was started again; None: about these notices.
+        notices, provider: with "foretold": notices of queries that it holds, and the registrar that sends them.
     """
 
     what: What
@@ -76,6 +84,10 @@ class Wanted(msgspec.Struct, frozen=True):
     sort: str = ""
     states: tuple[str, ...] = ()
     holder: str = ""
+    ids: tuple[str, ...] = ()
+    end: End | None = None
+    provider: str = ""
+    notices: tuple[Notice, ...] = ()
 
 
 def priority_text(priority: int | None) -> str:
@@ -109,6 +121,7 @@ class ResourceRow(msgspec.Struct, frozen=True):
         holders: the first 20 queries on it; `holder_count`: how many there are.
         parts: the ids of the first 20 queries that it depends on; `part_count`: how many there are.
         part_resources: the ids of the resources that those are on, of those that are loaded.
+        title: of the request; "" if its server gives none.
         priority: the highest of its holders; None: all have it on standby, or nobody holds it.
         revoked: its holders are letting it go, because its owner has revoked it, or one of its parts is revoked.
     """
@@ -128,11 +141,17 @@ class ResourceRow(msgspec.Struct, frozen=True):
     priority: int | None = 0
     revoked: bool = False
     part_resources: list[str] = []
+    title: str = ""
+
+    @property
+    def text(self) -> str:
+        """Its request for people: the title, if it has one."""
+        return self.title or self.request
 
     @property
     def name(self) -> str:
-        """Its server and its request, shortened for people."""
-        return named(self.server, self.request)
+        """Its server and its request or title, shortened for people."""
+        return named(self.server, self.text)
 
     @property
     def condition(self) -> str:
@@ -166,6 +185,7 @@ class QueryRow(msgspec.Struct, frozen=True):
         hold: "pending" (asked for), "held", or "owed" (released, and its provider does not know yet).
         priority: None for standby.
         said: in a page of loads, the last report of the load callback that it waits for: "50% opening".
+        title: of the request, which its provider knows; "" if it has none.
     """
 
     id: str
@@ -178,11 +198,17 @@ class QueryRow(msgspec.Struct, frozen=True):
     state: str
     priority: int | None = 0
     said: str = ""
+    title: str = ""
+
+    @property
+    def text(self) -> str:
+        """Its request for people: the title, if it has one."""
+        return self.title or self.request
 
     @property
     def name(self) -> str:
         """The name of the resource that it is on."""
-        return named(self.server, self.request)
+        return named(self.server, self.text)
 
 
 class ServerRow(msgspec.Struct, frozen=True):
@@ -216,6 +242,7 @@ class LoadRow(msgspec.Struct, frozen=True):
         mean_s, longest_s: how long load callbacks took, in seconds.
         p95_s: the time within which 95 % of the newest 500 of them ended.
         seconds: how long all of them took together.
+        own_mean_s, own_p95_s: the same as mean_s and p95_s, without the time in which they waited for their parts.
     """
 
     server: str
@@ -228,15 +255,66 @@ class LoadRow(msgspec.Struct, frozen=True):
     p95_s: float
     longest_s: float
     seconds: float
+    own_mean_s: float = 0.0
+    own_p95_s: float = 0.0
 
 
-class Page(msgspec.Struct, frozen=True):
+class ForeseenResource(msgspec.Struct, frozen=True):
+    """What would become of a resource.
+
+    Attributes:
+        id: its id.
+        name: its server and its request or title, shortened for people.
+        becomes: "recovered" by its recover callback, "loaded again", "lost" or "unloaded"; or the state that it would
+            have: "ERROR".
+        message: of the status that its holders would hear.
+    """
+
+    id: str
+    name: str
+    becomes: str
+    message: str = ""
+
+
+class ForeseenStatus(msgspec.Struct, frozen=True):
+    """A status that the holder of a query would hear.
+
+    Attributes:
+        holder: the registrar that holds the query.
+        query_id: the query's id.
+        name: the resource's.
+        state, message: the status.
+        listens: whether an on_status callback would hear it; else only `query.state` would say it.
+    """
+
+    holder: str
+    query_id: str
+    name: str
+    state: str
+    message: str = ""
+    listens: bool = False
+
+
+class ForetoldPage(msgspec.Struct, frozen=True):
+    """What a registrar would do: with its resources, of which `kept` stay as they are, and which statuses it hears.
+
+    `notices`: those that it would send to the holders of its resources.
+    """
+
+    resources: tuple[ForeseenResource, ...] = ()
+    kept: int = 0
+    heard: tuple[ForeseenStatus, ...] = ()
+    notices: tuple[Notice, ...] = ()
+
+
+class RowPage(msgspec.Struct, frozen=True):
     """The wanted rows, and how many rows match in all. `response`: as JSON.
 
     Attributes:
         said: with "loads", the last reports of this registrar's own load callbacks, by the queries that wait for them.
         counts: of rows that are sorted by a number, how many have each number, the most first.
         keys: the number of each row, if they are sorted by one.
+        titles: of the requests of the queries that were asked for, and are known.
     """
 
     total: int
@@ -249,6 +327,8 @@ class Page(msgspec.Struct, frozen=True):
     said: dict[str, str] = {}
     counts: list[tuple[float, int]] = []
     keys: list[float] = []
+    titles: dict[str, str] = {}
+    foretold: ForetoldPage = ForetoldPage()
 
 
 STREAM_ORDERS: dict[str, Callable[[StreamRow], float]] = {
@@ -267,13 +347,15 @@ LOAD_ORDERS: dict[str, Callable[[LoadRow], float]] = {
     "mean": lambda row: row.mean_s,
     "p95": lambda row: row.p95_s,
     "longest": lambda row: row.longest_s,
+    "own mean": lambda row: row.own_mean_s,
+    "own p95": lambda row: row.own_p95_s,
 }
 """The numbers by which servers are sorted; of those where as many loads wait, the one with more loads comes first."""
 RESOURCE_ORDERS = ("resource", "state", "priority", "holders")
 """The orders of resources: by server and request, the worst state, the highest priority, or the most holders first."""
 
 
-def page_of(actor: RegistrarActor, wanted: Wanted) -> Page:
+def page_of(actor: RegistrarActor, wanted: Wanted) -> RowPage:
     """Return a page of what a registrar serves or holds. From any thread.
 
     Raises:
@@ -281,36 +363,80 @@ def page_of(actor: RegistrarActor, wanted: Wanted) -> Page:
     """
     match wanted.what:
         case "resources":
-            rows = _matching(_read(actor, lambda catalog: list(catalog.resources.values())), wanted.match, actor.name)
+            rows = _matching(_read(actor, lambda catalog: list(catalog.resources.values())), wanted.match, actor)
             rows, counts, keys = _in_order(actor, _of_state_and_holder(actor, rows, wanted), wanted.sort)
             here = slice(wanted.offset, wanted.offset + wanted.limit)
-            return Page(len(rows), _resource_rows(actor, rows[here]), counts=counts, keys=keys[here])
+            return RowPage(len(rows), _resource_rows(actor, rows[here]), counts=counts, keys=keys[here])
         case "queries":
-            held = _matching(_read(actor, lambda catalog: list(catalog.held.values())), wanted.match, actor.name)
+            held = _matching(_read(actor, lambda catalog: list(catalog.held.values())), wanted.match, actor)
             shown = held[wanted.offset : wanted.offset + wanted.limit]
-            return Page(len(held), queries=[_query_row(actor.name, row) for row in shown])
+            return RowPage(len(held), queries=[_query_row(actor.name, row) for row in shown])
         case "id":
             resources, queries = _of_id(actor, wanted.match)
             rows = _resource_rows(actor, resources)
-            return Page(len(resources) + len(queries), rows, [_query_row(actor.name, row) for row in queries])
+            return RowPage(len(resources) + len(queries), rows, [_query_row(actor.name, row) for row in queries])
         case "servers":
             servers = _server_rows(actor)
-            return Page(len(servers), servers=servers)
+            return RowPage(len(servers), servers=servers)
         case "loads":
-            waiting = _matching(waiting_loads(actor), wanted.match, actor.name)
+            waiting = _matching(waiting_loads(actor), wanted.match, actor)
             loads = [row for row in load_rows(actor) if wanted.match in row.server]
             queries = [_query_row(actor.name, row) for row in waiting[wanted.offset : wanted.offset + wanted.limit]]
-            return Page(len(waiting), queries=queries, loads=loads, said=actor.progress.said())
+            return RowPage(len(waiting), queries=queries, loads=loads, said=actor.progress.said())
         case "streams":
             streams, counts, keys = _stream_rows(actor, wanted.match), list[tuple[float, int]](), list[float]()
             if (key := STREAM_ORDERS.get(wanted.sort)) is not None:
                 streams, counts, keys = _by_number(streams, map(key, streams))
             here = slice(wanted.offset, wanted.offset + wanted.limit)
-            return Page(len(streams), streams=streams[here], counts=counts, keys=keys[here])
+            return RowPage(len(streams), streams=streams[here], counts=counts, keys=keys[here])
+        case "titles":
+            known = _read(
+                actor, lambda catalog: {id: row for id in wanted.ids if (row := catalog.find(id)) is not None}
+            )
+            return RowPage(len(known), titles={id: actor.title_of(row) for id, row in known.items()})
+        case "foretold":
+            found = _foretold(actor, wanted)
+            return RowPage(len(found.resources) + found.kept, foretold=found)
         case "response":
             row = _read(actor, lambda catalog: catalog.find(wanted.match))
             raw = None if row is None else row.response
-            return Page(int(raw is not None), response="" if raw is None else json_of(shown_plain(raw)))
+            return RowPage(int(raw is not None), response="" if raw is None else json_of(shown_plain(raw)))
+
+
+def _foretold(actor: RegistrarActor, wanted: Wanted) -> ForetoldPage:
+    """Return what a registrar would do. Only the copy of what it knows is made under its lock."""
+    known = _read(actor, known_of)
+    if wanted.end is not None:
+        found = foretell_restart(known, wanted.end)
+    else:
+        found = foretell_statuses(known, wanted.provider, wanted.notices)
+    return ForetoldPage(
+        tuple(
+            ForeseenResource(
+                one.resource.id,
+                named(
+                    f"{actor.name}/{one.resource.server}",
+                    actor.title_of(one.resource) or text_of_value(one.resource.request),
+                ),
+                one.becomes,
+                one.message,
+            )
+            for one in found.fates
+        ),
+        found.kept,
+        tuple(
+            ForeseenStatus(
+                actor.name,
+                one.query_id,
+                named(one.server, text_of_value(one.request)),
+                one.state,
+                one.message,
+                one.listens,
+            )
+            for one in found.heard
+        ),
+        found.notices,
+    )
 
 
 def _stream_rows(actor: RegistrarActor, match: str) -> list[StreamRow]:
@@ -321,8 +447,9 @@ def _stream_rows(actor: RegistrarActor, match: str) -> list[StreamRow]:
     for publisher in publishers:
         if (resource := resources.get(publisher.stream.resource_id)) is not None:
             server, request = f"{actor.name}/{resource.server}", text_of_value(resource.request)
-            if any(match in text for text in (resource.id, publisher.name, f"{server} {request}")):
-                rows.append(publisher.row(server, request))
+            texts = resource.id, publisher.name, f"{server} {request}", actor.title_of(resource)
+            if any(match in text for text in texts):
+                rows.append(replace(publisher.row(server, request), title=actor.title_of(resource)))
     return sorted(rows, key=lambda row: (row.info.server, row.request, row.info.name))
 
 
@@ -381,7 +508,9 @@ def load_rows(actor: RegistrarActor) -> list[LoadRow]:
         shared, ended = joined.get(name, 0) + late, times.loaded + times.failed
         begun = ended + running[name]
         counts = begun + shared, shared, begun + late, times.failed, loading[name]
-        seconds = times.seconds / ended if ended else 0.0, times.p95_s(), times.longest_s, times.seconds
+        mean_s, own_mean_s = (each / ended if ended else 0.0 for each in (times.seconds, times.own_seconds))
+        p95_s, own_p95_s = times.p95_s()
+        seconds = mean_s, p95_s, times.longest_s, times.seconds, own_mean_s, own_p95_s
         rows.append(LoadRow(f"{actor.name}/{name}", *counts, *seconds))
     return rows
 
@@ -414,8 +543,8 @@ def _read(actor: RegistrarActor, reader: Callable[[Catalog], _Found]) -> _Found:
         return reader(actor.whole())
 
 
-def _matching(rows: list[_Row], text: str, name: str) -> list[_Row]:
-    """Return the rows of the registrar `name` that have the text in them."""
+def _matching(rows: list[_Row], text: str, actor: RegistrarActor) -> list[_Row]:
+    """Return the rows of a registrar that have the text in them, or in the titles of the requests that it serves."""
     if not text:
         return rows
     raw, in_json = text.encode("utf-8", "replace"), json_of(text)[1:-1]
@@ -423,7 +552,9 @@ def _matching(rows: list[_Row], text: str, name: str) -> list[_Row]:
     decodes = _VALUE.search(text) is not None or any(text in word for word in ("true", "false", "null"))
 
     def matches(row: Resource | Held) -> bool:
-        if any(text in value for value in _texts(row, name)):
+        if any(text in value for value in _texts(row, actor.name)):
+            return True
+        if isinstance(row, Resource) and text in actor.title_of(row):
             return True
         if not (decodes or raw in row.request):
             return False
@@ -441,12 +572,24 @@ def _of_state_and_holder(actor: RegistrarActor, rows: list[Resource], wanted: Wa
         queries = catalog.holders.get(row.id, ()) if wanted.holder else ()
         return not wanted.holder or any(catalog.queries[id].origin == wanted.holder for id in queries)
 
-    if not (wanted.states or wanted.holder):
+    if wanted.states and not (wanted.holder or _STATES.issuperset(wanted.states)):
+        return list(itertools.compress(rows, _of_each(actor, rows, is_chosen)))
+    if wanted.states:  # of a few states that the rows have themselves: 100,000 rows without the lock
+        chosen = {state for state in State if str(state).lower() in wanted.states}
+        rows = [row for row in rows if row.state in chosen and row.phase is Phase.LOADED]
+    if not wanted.holder:
         return rows
     return list(itertools.compress(rows, _of_each(actor, rows, is_chosen)))
 
 
+def _began_here(catalog: Catalog, row: Resource) -> bool:
+    """Return whether no part of a resource is in trouble, so that its own trouble began here."""
+    parts = (catalog.held.get(id) for id in catalog.parts_of(row.id))
+    return all(part is None or part.state not in _TROUBLE for part in parts)
+
+
 _ORDERS: dict[str, Callable[[Catalog, Resource], float]] = {
+    "trouble": lambda catalog, row: 100 * _began_here(catalog, row) - CONDITIONS.index(_condition_in(catalog, row)),
     "state": lambda catalog, row: -CONDITIONS.index(_condition_in(catalog, row)),
     "priority": lambda catalog, row: STANDBY - 1 if row.id not in catalog.holders else catalog.priority_of(row.id),
     "holders": lambda catalog, row: len(catalog.holders.get(row.id, ())),
@@ -476,7 +619,7 @@ def _of_each(
 def _in_order(
     actor: RegistrarActor, rows: list[Resource], sort: str
 ) -> tuple[list[Resource], list[tuple[float, int]], list[float]]:
-    """Return resources in the order `sort`, with the counts and keys of a Page, if they are sorted by a number."""
+    """Return resources in the order `sort`, with the counts and keys of a RowPage, if they are sorted by a number."""
     if (key := _ORDERS.get(sort)) is not None:
         return _by_number(rows, _of_each(actor, rows, key))
     if sort == "resource":
@@ -489,7 +632,7 @@ def _in_order(
 def _by_number(
     rows: Iterable[_Sorted], keys: Iterable[float]
 ) -> tuple[list[_Sorted], list[tuple[float, int]], list[float]]:
-    """Return the rows by their keys, the highest first, with the counts and keys of a Page.
+    """Return the rows by their keys, the highest first, with the counts and keys of a RowPage.
 
     Many rows have few keys. So only the keys are sorted: other threads run meanwhile.
     """
@@ -545,7 +688,7 @@ def _resource_rows(actor: RegistrarActor, resources: list[Resource]) -> list[Res
         revoked = resource.id in catalog.revocations
         return _phase_in(catalog, resource), (holders, len(queries), shown, len(parts), priority, revoked, below)
 
-    neighbours = _read(actor, lambda catalog: [around(catalog, resource) for resource in resources])
+    neighbours = _of_each(actor, resources, around)
     rows: list[ResourceRow] = []
     for row, (phase, others) in zip(resources, neighbours, strict=True):
         state = str(row.state) if row.phase is Phase.LOADED else ""
@@ -555,7 +698,9 @@ def _resource_rows(actor: RegistrarActor, resources: list[Resource]) -> list[Res
         elif row.server not in actor.catalog.servers:
             message = failures.waits_for_server(actor.catalog, row)
         texts = text_of_value(row.request), text_of_value(row.response), phase, state, message
-        rows.append(ResourceRow(row.id, f"{actor.name}/{row.server}", *texts, row.attempt, *others))
+        rows.append(
+            ResourceRow(row.id, f"{actor.name}/{row.server}", *texts, row.attempt, *others, actor.title_of(row))
+        )
     return rows
 
 

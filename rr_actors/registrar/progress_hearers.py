@@ -72,7 +72,8 @@ def hearer_of(progress: object, actor: RegistrarActor) -> Hearer | None:
     """Return the hearer that load()'s argument `progress` asks for; None if it asks for none.
 
     Raises:
-        UsageError: `progress` is neither a bool nor a plain callable; or it is True, and rich is not installed.
+        UsageError: `progress` is neither a bool nor a plain callable.
+        MissingDependency: it is True, and rich is not installed.
     """
     if progress is False or progress is None:
         return None

@@ -23,7 +23,7 @@ from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.engine.status import StatusMessage, state_of, status_of
-from rr_actors.registrar.model.rows import OK, Held, Hold, Notice, Phase, ServerType, State
+from rr_actors.registrar.model.rows import OK, REVOKED, Held, Hold, Notice, Phase, ServerType, State
 from rr_actors.runtime.callback_errors import log_raised
 from rr_actors.runtime.event_loop import check_asyncio, check_may_block
 from rr_actors.runtime.shielding import Flag
@@ -59,7 +59,7 @@ class Holder(Protocol):
     async def unload_async(self, query_or_id: Query, /, *, timeout_s: float | None = 30.0) -> None:
         """Release the query, awaited."""
 
-    def fetch_state(self, query_or_id: Query, /) -> str:
+    def fetch_state(self, query_or_id: Query, /) -> State:
         """Return the state of the query's last status, as the registrar has it."""
         ...
 
@@ -157,7 +157,7 @@ class Query(Generic[Response]):
         registrar, server: the registrar and the server that serve the resource.
         parent: the id of the holder's own resource that depends on it; "" for none.
         state: the state of the last status; OK at first.
-        released: whether the provider has taken the resource away.
+        released: whether the provider has taken the resource away; after a revocation, when the query is released.
     """
 
     __slots__ = (
@@ -165,6 +165,7 @@ class Query(Generic[Response]):
         "_codec",
         "_holder",
         "_is_released",
+        "_is_revoked",
         "_request",
         "_response",
         "_statuses",
@@ -201,6 +202,7 @@ class Query(Generic[Response]):
         self._holder = holder
         self._codec: Codec | None = None  # of the response type that the load was given
         self._is_released = False
+        self._is_revoked = False
         self._request: Any = _Bytes(request)
         self._response: Any = None
         self._types = types
@@ -261,7 +263,7 @@ class Query(Generic[Response]):
         await self._at_holder().unload_async(self, timeout_s=timeout_s)
         self._is_released = True
 
-    def fetch_state(self) -> str:
+    def fetch_state(self) -> State:
         """Ask the registrar that holds the query for the state of its last status.
 
         Raises:
@@ -435,6 +437,7 @@ class Query(Generic[Response]):
         if response is not None:
             self._response = _Bytes(response)
         self.released = self.released or released
+        self._is_revoked = self._is_revoked or status.reason == REVOKED
         if self._statuses is None:
             self._statuses = _Statuses()
         self._statuses.hear(status)
@@ -443,6 +446,7 @@ class Query(Generic[Response]):
     def _end(self) -> None:
         """Note that the query is not held any more, and wake the threads that wait for a status. On the loop."""
         self._is_released = True
+        self.released = self.released or self._is_revoked
         self._wake()
 
     def _wake(self) -> None:
@@ -473,7 +477,7 @@ class Query(Generic[Response]):
         for name, value in state.items():
             setattr(self, name, value)
         self._holder = self._codec = self._waiters = self._statuses = None
-        self._is_released = False
+        self._is_released = self._is_revoked = False
         self._types, self._all_streams = _no_types, _not_known
 
     def _read_as(self, codec: Codec) -> Self:

@@ -36,10 +36,12 @@ from rr_actors.registrar.arguments import (
     Parent,
     callers_loop,
     check_allowed,
+    check_keywords,
     check_text,
     checked,
     checked_callback,
     checked_priority,
+    passed_on,
     resource_target,
     server_target,
     shows,
@@ -53,7 +55,7 @@ from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.engine.registrar_base import RegistrarBase
 from rr_actors.registrar.engine.server import RECOVER_S, ServerSpec, checked_spec, checked_whole, log_unread_types
 from rr_actors.registrar.engine.status import message_text
-from rr_actors.registrar.links.provider_link import ListQueries
+from rr_actors.registrar.links.provider_link import FetchQueries
 from rr_actors.registrar.links.remote_calls import for_handles
 from rr_actors.registrar.load_groups import Group, GroupWays, LoadWanted, Queries, wanted
 from rr_actors.registrar.loads import CALL_TIMEOUT_S, Calls, Loads, LoadWays, Unloads, UnloadWays, settle
@@ -74,7 +76,7 @@ from rr_actors.registrar.model.rows import (
     types_id,
 )
 from rr_actors.registrar.model.rows import ServedQuery as QueryRow
-from rr_actors.registrar.pages import Page, Wanted, counted_loads, load_rows, page_of
+from rr_actors.registrar.pages import RowPage, Wanted, counted_loads, load_rows, page_of
 from rr_actors.registrar.queries import (
     PLAIN,
     Query,
@@ -121,9 +123,10 @@ _KEPT = (
     "and returns the response, or recovery='reload' or 'lost'. If they live outside the process, say recovery='keep'."
 )
 
-NO_FIELDS: dict[str, object] = {}
-_ALL_STREAMS = Wanted("streams", limit=sys.maxsize)
+NO_FIELDS: Any = {}
 """The request of a load that gives none."""
+
+_ALL_STREAMS = Wanted("streams", limit=sys.maxsize)
 
 _IN_ONE_STEP = 200  # rows: an answer with more holds Python's lock for longer than 5 ms
 _SHOWN = 50  # rows of a picture in a notebook
@@ -140,6 +143,7 @@ class Consumer(abc.ABC):
 
     _unload_ways: UnloadWays
     _warned_in_event_loop = False
+    _is_alone = True  # the system ends at this host, so a server's id is what it says
     _encode = staticmethod(encode)
 
     @property
@@ -173,22 +177,6 @@ class Consumer(abc.ABC):
         """Return whether the calling thread may wait."""
 
     @abc.abstractmethod
-    def fetch_state(self, query_or_id: Query | str) -> str:
-        """Return the state of the last status of a query, as its registrar has it."""
-
-    @abc.abstractmethod
-    def fetch_priority(self, query_or_id: Query | str) -> int | None:
-        """Return the priority of a query, as its registrar has it."""
-
-    @abc.abstractmethod
-    def set_priority(self, query_or_id: Query | str, priority: int | None) -> None:
-        """Give a query a priority."""
-
-    @abc.abstractmethod
-    def set_on_status(self, query_or_id: Query | str, callback: StatusCallback | None) -> None:
-        """Replace the status callback of a query."""
-
-    @abc.abstractmethod
     def _listen(self, server: str, id: str, callback: StatusCallback) -> None:
         """Have the callback called for every query at a server, until _stop_listening() gets the same id."""
 
@@ -214,63 +202,31 @@ class Consumer(abc.ABC):
 
     # -- load ----------------------------------------------------------------------------------------------------
 
+    # The overloads have bodies for Jedi: see passed_on().
+
     @overload
     def load(
         self,
-        server: Declared[Request, Any, Response],
+        server: str | Declared[Request, Any, Response],
         request: Request = ...,
-        *,
-        block: Literal[True] = True,
-        **options: Unpack[LoadKeywords],
-    ) -> Query[Response]: ...
-    @overload
-    def load(
-        self,
-        server: Declared[Request, Any, Response],
-        request: Request = ...,
-        *,
-        block: Literal[False],
-        **options: Unpack[LoadKeywords],
-    ) -> pykka.Future[Query[Response]]: ...
-    @overload
-    def load(
-        self,
-        server: str,
-        request: object = ...,
         *,
         response_type: type[Response] | None = None,
         block: Literal[True] = True,
         **options: Unpack[LoadKeywords],
-    ) -> Query[Response]: ...
+    ) -> Query[Response]:
+        return passed_on(**options)
+
     @overload
     def load(
         self,
-        server: str,
-        request: object = ...,
+        server: str | Declared[Request, Any, Response],
+        request: Request = ...,
         *,
         response_type: type[Response] | None = None,
         block: Literal[False],
         **options: Unpack[LoadKeywords],
-    ) -> pykka.Future[Query[Response]]: ...
-    @overload
-    def load(
-        self,
-        server: Declared[Request, Any, Any],
-        request: Request = ...,
-        *,
-        block: bool = True,
-        **options: Unpack[LoadKeywords],
-    ) -> Query[Any] | pykka.Future[Query[Any]]: ...
-    @overload
-    def load(
-        self,
-        server: str,
-        request: object = ...,
-        *,
-        response_type: Any = None,
-        block: bool = True,
-        **options: Unpack[LoadKeywords],
-    ) -> Query[Any] | pykka.Future[Query[Any]]: ...
+    ) -> pykka.Future[Query[Response]]:
+        return passed_on(**options)
 
     @shows(LoadKeywords)
     def load(
@@ -325,39 +281,24 @@ class Consumer(abc.ABC):
         """
         if block and asyncio._get_running_loop() is not None:
             self._warn_in_event_loop("load", "load_async")
-        wanted = checked("load", options, response_type) if options or response_type is not None else DEFAULTS
+        wanted = checked("load", response_type, **options) if options or response_type is not None else DEFAULTS
         owner, parent = self._holder(wanted.parent)
-        target = (
-            parsed_server(server) if type(server) is str and "/" in server else self._target(server, wanted.timeout_s)
-        )
+        is_plain = type(server) is str and "/" in server and self._is_alone
+        target = parsed_server(server) if is_plain else self._target(server, wanted.timeout_s)
         loads = owner._load_ways
         return (loads.wait if block else loads.begin)(target, self._encode(request), parent, wanted)
-
-    @overload
-    async def load_async(
-        self, server: Declared[Request, Any, Response], request: Request = ..., **options: Unpack[LoadKeywords]
-    ) -> Query[Response]: ...
-    @overload
-    async def load_async(
-        self,
-        server: str,
-        request: object = ...,
-        *,
-        response_type: type[Response] | None = None,
-        **options: Unpack[LoadKeywords],
-    ) -> Query[Response]: ...
 
     @shows(LoadKeywords)
     async def load_async(
         self,
-        server: str | Declared[Any, Any, Any],
-        request: Any = NO_FIELDS,
+        server: str | Declared[Request, Any, Response],
+        request: Request = NO_FIELDS,
         *,
-        response_type: Any = None,
+        response_type: type[Response] | None = None,
         **options: Unpack[LoadKeywords],
-    ) -> Query[Any]:
+    ) -> Query[Response]:
         """Load as load() does, awaited. If it is cancelled, the load is withdrawn."""
-        wanted = checked("load_async", options, response_type)
+        wanted = checked("load_async", response_type, **options)
         owner, parent = self._holder(wanted.parent)
         target = self._target(server, wanted.timeout_s)
         return await owner._load_ways.awaited(target, self._encode(request), parent, wanted)
@@ -404,8 +345,9 @@ class Consumer(abc.ABC):
 
     def _asked(self, called: str, requests: Iterable[tuple[str, Any]], given: GroupKeywords) -> GroupWays:
         """Return a group of loads that has not begun, with its arguments checked."""
+        check_keywords(called, given, GroupKeywords)
         asked = wanted(requests, self._target, self._encode)
-        options = checked(called, given, names=GroupKeywords)
+        options = checked(called, **given)
         owner, parent = self._holder(options.parent)
         return owner._group(asked, parent, options)
 
@@ -543,6 +485,7 @@ class Registrar(Consumer):
     def __init__(self, node: Node, actor: RegistrarActor) -> None:
         self._actor = actor
         self._node = node
+        self._is_alone = node.info.hosts is None
         self._calls = Calls(actor)
         self._views = Views(actor, self)
         self._loads = Loads(self._calls, self._views)
@@ -620,6 +563,7 @@ class Registrar(Consumer):
         at_once: int | None = None,
         exclusive: bool = False,
         grace_s: float | None = None,
+        title: Callable[..., str] | None = None,
     ) -> None:
         """Offer resources of a new kind as "<this registrar>/<name>".
 
@@ -669,6 +613,9 @@ class Registrar(Consumer):
             grace_s: how long the holder of an exclusive resource has to release it when a load with a higher priority
                 waits. It hears FATAL, with ``status.reason == "revoked"``. Default: None, 5 seconds. Raise it if
                 holders need longer to save their work.
+            title: ``title(request)`` returns what lists, pictures and events show in the place of the request. It is
+                called from several threads, and must not wait. Default: None, the request's method ``__rr_title__``,
+                if it has one. Give one where requests are long.
 
         Raises:
             InvalidName: `name` has other characters than ASCII letters, digits, "_", "-" and ".".
@@ -680,7 +627,7 @@ class Registrar(Consumer):
         limits = linger_s, load_timeout_s, recovery, recover_timeout_s
         spec = ServerSpec(name, *callbacks, *types, *limits, usage=usage, idle=idle, paused_s=paused_s)
         spec = replace(spec, pause=pause, resume=resume, health=health, probe=probe)
-        spec = replace(spec, provides=provides, at_once=at_once, exclusive=exclusive, grace_s=grace_s)
+        spec = replace(spec, provides=provides, at_once=at_once, exclusive=exclusive, grace_s=grace_s, title=title)
         self._register_spec(checked_whole(checked_spec(spec)))
 
     def _register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:
@@ -749,7 +696,7 @@ class Registrar(Consumer):
             catalog = self._actor.whole()
             held = catalog.held.get(query_id)
             whole = None if held is None or held.hold is Hold.OWED else catalog.resources.get(held.parent)
-            failure = None if whole is None else failures.held_by_whole(query_id, _name_of(whole, self.name))
+            failure = None if whole is None else failures.held_by_whole(query_id, _name_of(whole, self._actor))
         if failure is not None:
             raise error_of(failure)
 
@@ -1001,13 +948,13 @@ class Registrar(Consumer):
         return [self._views.of(row) for row in rows]
 
     @for_handles(repeatable=True)
-    def fetch_state(self, query_or_id: Query | str) -> str:
-        """Return the state of the last status of a query that this registrar holds: "OK", "WARNING" ...
+    def fetch_state(self, query_or_id: Query | str) -> State:
+        """Return the state of the last status of a query that this registrar holds.
 
         Raises:
             UnknownQuery: the query is not held any more.
         """
-        return str(self._calls.call(self._held_row, target_id(query_or_id)).state)
+        return self._calls.call(self._held_row, target_id(query_or_id)).state
 
     @for_handles(repeatable=True)
     def fetch_priority(self, query_or_id: Query | str) -> int | None:
@@ -1055,7 +1002,7 @@ class Registrar(Consumer):
             if not future.done():
                 settle(future, error, queries)
 
-        self._calls.dispatcher.call(lambda: self._actor.client(registrar).deliver(ListQueries(fetched)))
+        self._calls.dispatcher.call(lambda: self._actor.client(registrar).deliver(FetchQueries(fetched)))
         rows = self._calls.finish(future, limit_s, f"fetching from {registrar!r}")
         return [self._fetched_view(registrar, row) for row in rows]
 
@@ -1257,7 +1204,7 @@ class Registrar(Consumer):
         }
 
     @for_handles(repeatable=True)
-    def _page(self, wanted: Wanted) -> Page:
+    def _page(self, wanted: Wanted) -> RowPage:
         """Return a few of this registrar's resources or queries as text, for tools that show the system."""
         return page_of(self._actor, wanted)
 
@@ -1367,7 +1314,7 @@ def _batched(ids: list[str]) -> Iterator[list[str]]:
         yield ids[begin : begin + _IN_ONE_STEP]
 
 
-def page(registrar: Registrar, wanted: Wanted) -> Page:
+def page(registrar: Registrar, wanted: Wanted) -> RowPage:
     """Return a page of what a registrar, of this process or another, serves or holds.
 
     Raises:
@@ -1400,8 +1347,9 @@ def begin_planned(registrar: Registrar, server: str, request: Any, **options: Un
     A planner finds by that, in its next process, what it may release. Arguments and errors are those of
     Registrar.load().
     """
-    loads, wanted = registrar._loads, checked("load", options)  # pyright: ignore[reportPrivateUsage]  # same file
-    return loads.begin(parse_server(server), encode(request), "", wanted, planned_id())
+    loads, wanted = registrar._loads, checked("load", **options)  # pyright: ignore[reportPrivateUsage]  # same file
+    target = registrar._target(server)  # pyright: ignore[reportPrivateUsage]  # same file
+    return loads.begin(target, encode(request), "", wanted, planned_id())
 
 
 def begin_revocation(registrar: Registrar, resource_id: str, why: str, grace_s: float) -> Reply[None]:
@@ -1416,5 +1364,6 @@ def registrar_of(actor: RegistrarBase | None) -> Registrar | None:
     return holder if isinstance(holder, Registrar) else None
 
 
-def _name_of(resource: Resource, registrar: str) -> str:
-    return named(f"{registrar}/{resource.server}", text_of_value(resource.request))
+def _name_of(resource: Resource, actor: RegistrarActor) -> str:
+    text = actor.title_of(resource) or text_of_value(resource.request)
+    return named(f"{actor.name}/{resource.server}", text)

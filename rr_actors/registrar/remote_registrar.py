@@ -30,6 +30,7 @@ from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.engine.server import ServerSpec, log_unread_types
 from rr_actors.registrar.links.remote_calls import GRACE_S, HandleLine, is_for_handles
 from rr_actors.registrar.load_groups import GroupWays, LoadWanted, Queries
+from rr_actors.registrar.loads import LoadWays, UnloadWays
 from rr_actors.registrar.model.roles import ROLES
 from rr_actors.registrar.queries import Holder, Query, held_by, read_as
 from rr_actors.registrar.registrar import Registrar
@@ -155,7 +156,7 @@ def _owned(own: Callable[[T], T], sent: Reply[T]) -> T:
     return own(sent.take())
 
 
-class RemoteLoads(abc.ABC):
+class RemoteLoads(LoadWays, abc.ABC):
     """The loads of a registrar that another process has. From any thread."""
 
     def __init__(self, calls: RemoteCalls, holder: Holder) -> None:
@@ -179,15 +180,12 @@ class RemoteLoads(abc.ABC):
         return query if options.codec is None else read_as(query, options.codec)
 
     def begin(self, target: ServerId, request: bytes, parent: str, options: LoadOptions) -> Reply[Query]:
-        """Begin a load, and return the future of its query at once."""
         return self._begun(target, request, parent, options).begin()
 
     def wait(self, target: ServerId, request: bytes, parent: str, options: LoadOptions) -> Query:
-        """Load a resource, and return its query when the resource is held."""
         return self._begun(target, request, parent, options).wait(options.timeout_s)
 
     async def awaited(self, target: ServerId, request: bytes, parent: str, options: LoadOptions) -> Query:
-        """Load a resource, awaited on any event loop. If it is cancelled, the load is withdrawn."""
         return await self._begun(target, request, parent, options).awaited(options.timeout_s)
 
     def _begun(self, target: ServerId, request: bytes, parent: str, options: LoadOptions) -> _Begun[Query]:
@@ -223,7 +221,7 @@ class RemoteLoads(abc.ABC):
             logger.exception("%r: its load was cancelled, and it is not released", query)
 
 
-class RemoteGroup:
+class RemoteGroup(GroupWays):
     """The loads of one load_all() by a registrar that another process has."""
 
     def __init__(self, loads: RemoteLoads, requests: Sequence[LoadWanted], parent: str, options: LoadOptions) -> None:
@@ -239,16 +237,14 @@ class RemoteGroup:
         return Queries(self._loads.own(query, self._options) for query in queries)
 
     def wait(self) -> Queries:
-        """Load all requests, and return their queries when all are held."""
         return self._begun().wait(self._options.timeout_s)
 
     async def awaited(self) -> Queries:
-        """Load all requests, awaited on any event loop. If it is cancelled, all queries are released."""
         return await self._begun().awaited(self._options.timeout_s)
 
 
-class RemoteUnloads:
-    """The unloads of a registrar that another process has. From any thread."""
+class RemoteUnloads(UnloadWays):
+    """The unloads of a registrar that another process has."""
 
     def __init__(self, calls: RemoteCalls, release: str = "unload", release_client: str = "unload_client") -> None:
         self._calls = calls
@@ -256,31 +252,24 @@ class RemoteUnloads:
         self._release_client = release_client  # the one that releases all at a server
 
     def begin(self, query_id: str, timeout_s: float | None) -> Reply[None]:
-        """Begin to release a query, and return a future of its end at once."""
         return self._begun(self._release, query_id, timeout_s=timeout_s)
 
     def wait(self, query_id: str, timeout_s: float | None) -> None:
-        """Release a query, and return when that is done."""
         self._calls.ask(self._release, query_id, timeout_s=timeout_s)
 
     async def awaited(self, query_id: str, timeout_s: float | None) -> None:
-        """Release a query, awaited on any event loop. If it is cancelled, the release goes on."""
         await self.begin(query_id, timeout_s)
 
     def force_begin(self, target: str, timeout_s: float | None) -> Reply[None]:
-        """Begin to unload a resource that the registrar serves, even if it is held."""
         return self._begun("unload", target, force=True, timeout_s=timeout_s)
 
     def force_wait(self, target: str, timeout_s: float | None) -> None:
-        """Unload a resource that the registrar serves, even if it is held, and return when that is done."""
         self._calls.ask("unload", target, force=True, timeout_s=timeout_s)
 
     def begin_all(self, server: ServerId | None, timeout_s: float | None) -> Reply[None]:
-        """Begin to release all queries at a server, or, for None, all that the registrar holds for itself."""
         return self._begun(*self._all_at(server), timeout_s=timeout_s)
 
     def wait_all(self, server: ServerId | None, timeout_s: float | None) -> None:
-        """Release as begin_all() does, and return when all have been tried."""
         self._calls.ask(*self._all_at(server), timeout_s=timeout_s)
 
     def _all_at(self, server: ServerId | None) -> tuple[str, ...]:
@@ -388,6 +377,7 @@ class RegistrarHandle(Registrar):
     ) -> None:
         self._owner = owner  # kept alive while this handle is in use
         self._node = node
+        self._is_alone = node.info.hosts is None
         self._name = name
         self._far = HandleCalls(node.handle(name), name, patient=patient)
         self._unload_ways = RemoteUnloads(self._far, "_unload_from_outside", "_unload_client_from_outside")

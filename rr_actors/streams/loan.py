@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any, Protocol, cast
 
 from rr_actors.base import pickling
-from rr_actors.base.errors import UsageError, shown
+from rr_actors.base.errors import MissingDependency, UsageError, shown
 from rr_actors.wire.segments import Parcel
 
 
@@ -39,7 +39,8 @@ class Loan:
         try:
             import numpy  # most programs do without; it is not among the package's requirements
         except ImportError:
-            raise UsageError(f"{what} makes arrays of numpy, which is not installed: pip install numpy") from None
+            text = f"{what} makes arrays of numpy, which is not installed. Install it with: pip install numpy"
+            raise MissingDependency(text, module="numpy", install="pip install numpy") from None
         try:
             array = numpy.empty(shape, cast(Any, dtype))
         except (TypeError, ValueError, MemoryError) as error:

@@ -66,7 +66,7 @@ class _Meter:
 
     def __init__(self) -> None:
         self.frames = self._bytes = 0
-        self._at = self._due = 0.0
+        self._at = self._due = self.best_hz = 0.0
         self._marks: deque[tuple[float, int, int]] = deque(maxlen=_MARKS)
 
     def note(self, size: int) -> int:
@@ -76,6 +76,9 @@ class _Meter:
         self._at = now = time.monotonic()
         if now >= self._due:
             self._due = now + _MARK_S
+            if len(self._marks) == _MARKS:
+                began, frames, _ = self._marks[0]
+                self.best_hz = max(self.best_hz, (self.frames - frames) / (now - began))
             self._marks.append((now, self.frames, self._bytes))
         return self.frames
 
@@ -200,7 +203,7 @@ class Publisher:
         missed = sum(reader.missed for reader in readers)
         frames, (rate_hz, bytes_per_s, age_s) = self._meter.frames, self._meter.read()
         place = (f"{self.stream.resource_id}/{self.name}", self.name, server, self.stream.resource_id)
-        info = StreamInfo(*place, rate_hz, bytes_per_s, len(readers), missed, age_s)
+        info = StreamInfo(*place, rate_hz, bytes_per_s, len(readers), missed, age_s, self._meter.best_hz)
         return StreamRow(info, request, frames, readers)
 
     def _readers(self) -> list[KnownReader]:

@@ -89,6 +89,7 @@ class StreamInfo(msgspec.Struct, frozen=True):
         consumers: how many readers it has.
         missed: how many frames its readers missed, all together.
         age_s: how many seconds ago the last frame was published; None: there was none.
+        best_hz: the highest rate of any ten seconds since it was opened; 0 before there were ten.
     """
 
     id: str
@@ -100,6 +101,7 @@ class StreamInfo(msgspec.Struct, frozen=True):
     consumers: int
     missed: int
     age_s: float | None
+    best_hz: float = 0.0
 
 
 class StreamRow(msgspec.Struct, frozen=True):
@@ -110,12 +112,14 @@ class StreamRow(msgspec.Struct, frozen=True):
         request: that of its resource as JSON, cut if it is long.
         frames: how many were published since it was opened.
         readers: those who read it now.
+        title: of the request; "" if it has none.
     """
 
     info: StreamInfo
     request: str
     frames: int
     readers: list[ReaderRow]
+    title: str = ""
 
 
 Tell = Callable[[StreamHappening, Stream, str, Stream | None], None]

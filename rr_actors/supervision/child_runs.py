@@ -20,9 +20,9 @@ from msgspec.structs import replace
 
 from rr_actors.actors.actor import ExitReport
 from rr_actors.base import pickling
-from rr_actors.base.errors import StartFailed, Unavailable, text_of
+from rr_actors.base.errors import StartFailed, Unavailable
 from rr_actors.base.reporting.log import Log
-from rr_actors.base.reporting.tracebacks import ProcessStacks, add_note, trace_of
+from rr_actors.base.reporting.tracebacks import ProcessStacks, add_note
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.engine.node import Node
@@ -31,8 +31,8 @@ from rr_actors.runtime.processes.process import Exited, Process, signal_name
 from rr_actors.runtime.time_limits import wait_while_running
 from rr_actors.supervision import control_channel as control
 from rr_actors.supervision.core.specs import ChildSpec, Shutdown
-from rr_actors.supervision.core.state import Exit, Reason, Report, StartChild, Why
-from rr_actors.supervision.event_history import Record
+from rr_actors.supervision.core.state import Exit, Reason, StartChild, Why
+from rr_actors.supervision.event_history import RunFacts
 from rr_actors.supervision.heartbeat import Heartbeat
 from rr_actors.supervision.hosted import prepare
 
@@ -427,43 +427,8 @@ class Life:
         """The seconds since it became ready, by the monotonic clock; None before."""
         return None if self.ready_at is None else time.monotonic() - self.ready_at
 
-
-def record_of(report: Report, path: str, kind: str, life: Life | None) -> Record:
-    """Return the Record of a report of the core, completed with the facts of the run."""
-    exit, error = report.exit, report.error
-    if exit is not None:
-        code = exit.code
-    else:  # a StartFailed has the code if the process died before it was ready
-        code = error.details.get("code") if isinstance(error, StartFailed) else None
-    restarted = report.event == "started" and life is not None and life.why is Why.RESTART
-    return Record(
-        event="restarted" if restarted else report.event,
-        path=path,
-        kind=kind,
-        run=report.run,
-        at=time.time(),
-        state=report.state,
-        pid=None if life is None else life.pid,
-        reason="" if exit is None else exit.reason,
-        detail=_detail(report),
-        code=code,
-        signal=signal_name(-code) if code is not None and code < 0 else "",
-        traceback=_traceback(report),
-        restarts=report.restarts,
-        delay_s=report.delay_s,
-        ready_s=None if life is None or life.ready_at is None else life.ready_at - life.began,
-        up_s=None if life is None or exit is None else life.up_s,
-    )
-
-
-def _detail(report: Report) -> str:
-    if report.error is not None:
-        text, wanted = text_of(report.error), wanted_by(report.error)
-        return text if wanted in text else f"{text}: {wanted}"
-    return "" if report.exit is None else report.exit.detail
-
-
-def _traceback(report: Report) -> str:
-    if report.event == "start_failed" and report.error is not None:
-        return trace_of(report.error)
-    return "" if report.exit is None else report.exit.traceback
+    @property
+    def facts(self) -> RunFacts:
+        """What a record says of it now."""
+        ready_s = None if self.ready_at is None else self.ready_at - self.began
+        return RunFacts(self.why is Why.RESTART, self.pid, ready_s, self.up_s)

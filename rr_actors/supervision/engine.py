@@ -21,7 +21,7 @@ from rr_actors.base.steps import Steps
 from rr_actors.registrar.engine.node import Node
 from rr_actors.runtime.callback_errors import described_error
 from rr_actors.runtime.processes import lifeline
-from rr_actors.supervision.child_runs import Life, LocalRun, ProcessRun, Run, Target, record_of
+from rr_actors.supervision.child_runs import Life, LocalRun, ProcessRun, Run, Target
 from rr_actors.supervision.core import restarts
 from rr_actors.supervision.core.child_calls import find_child
 from rr_actors.supervision.core.children import Children
@@ -42,7 +42,7 @@ from rr_actors.supervision.core.state import (
     Why,
 )
 from rr_actors.supervision.core.transition import Draft
-from rr_actors.supervision.event_history import History, Record
+from rr_actors.supervision.event_history import History, Record, record_of
 from rr_actors.supervision.given_up import give_up
 from rr_actors.supervision.name_entries import Entries, KeptChildren, manager_of, registrars_of
 from rr_actors.wire.name_service import Presence, Turn
@@ -335,8 +335,8 @@ class Supervision:
 
     def _died_in_callback(self, life: Life, runs: str, is_proven: bool) -> None:
         logger.warning(
-            "supervisor %s: the last process of %s died while callbacks of its resources ran: this restart does not"
-            " count%s. They were: %s",
+            "supervisor %s: the last process of %s died while callbacks of its resources ran: its restart is taken off"
+            " the count again%s. They were: %s",
             self.path,
             life.path,
             "" if is_proven else ", unless they end well now",
@@ -378,7 +378,8 @@ class Supervision:
         kind = "actor"
         if spec is not None and (spec.type == "supervisor" or manager_of(spec) is not None):
             kind = "supervisor" if spec.type == "supervisor" else "manager"
-        record = record_of(report, path, kind, self._lives.get(report.run))
+        life = self._lives.get(report.run)
+        record = record_of(report, path, kind, time.time(), None if life is None else life.facts)
         self.history.add(record)
         self._node.emit(record.event, **record.facts())
         status = Presence.GONE if report.state is None else _STATUS[report.state]
@@ -388,7 +389,10 @@ class Supervision:
             status = Presence.GONE
         closed = {name for name in self.entries.registrars_of(spec, path) if self._is_gone(name)}
         child = self.tree.children.get(report.id)
-        is_due = status is Presence.STARTING and child is not None and child.phase is ChildPhase.DUE
+        if status is Presence.STOPPED:  # else what becomes of it is for the supervisor of this one to say
+            is_due = self.tree.mode in (Mode.STOPPING, Mode.STOPPED)
+        else:
+            is_due = status is Presence.STARTING and child is not None and child.phase is ChildPhase.DUE
         self._retire(self.entries.mark(spec, path, status, _why(record), Turn.DUE if is_due else None), closed)
         if status is Presence.STOPPED and self.kept.has(report.id) and self.tree.mode in (Mode.STARTING, Mode.RUNNING):
             self.entries.mark_dormant(spec, path, _why(record))

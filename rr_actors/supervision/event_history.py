@@ -9,12 +9,17 @@ from __future__ import annotations
 import logging
 import time
 from collections import deque
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
+from rr_actors.base.errors import StartFailed, text_of
 from rr_actors.base.notebook import bundle, table
 from rr_actors.base.reporting.log import Log
+from rr_actors.base.reporting.tracebacks import trace_of
+from rr_actors.base.scarcity import wanted_by
+from rr_actors.runtime.processes.process import signal_name
+from rr_actors.supervision.core.state import Report
 
 logger = Log("rr_actors.supervision")
 
@@ -33,7 +38,7 @@ class Record(msgspec.Struct, frozen=True):
             "auto_shutdown" (because of this significant child).
         path: the child's.
         kind: "manager", "actor" or "supervisor".
-        run: the number of its start; starts are numbered over all children of the supervisor.
+        run: how often the child has been started, this start included.
         at: when, seconds since the epoch.
         state: the child's from then on: "running", "starting", "restarting", "stopped"; None when it is forgotten.
         pid: the id of its process.
@@ -77,7 +82,10 @@ class Record(msgspec.Struct, frozen=True):
         return {key: value for key, value in facts.items() if value not in (None, "", 0)} | {"state": self.state}
 
     def __str__(self) -> str:
-        shown = {key: value for key, value in self.facts().items() if key not in ("kind", "at", "traceback")}
+        hidden = {"kind", "at", "traceback"}
+        if self.signal:  # it says what the code says, and at times the detail
+            hidden |= {"code", "detail"} if self.detail == self.signal else {"code"}
+        shown = {key: value for key, value in self.facts().items() if key not in hidden}
         return " ".join([self.event, *(f"{key}={_short(value)}" for key, value in shown.items())])
 
 
@@ -131,6 +139,58 @@ class History:
                 break
             found.append(_how(record))
         return found[::-1]
+
+
+class RunFacts(NamedTuple):
+    """Facts of the run that a report is about: whether its start was a restart, its process, and two times in seconds.
+
+    `ready_s`: from its start until it was ready. `up_s`: from then until now. None if it did not come to that.
+    """
+
+    is_restart: bool
+    pid: int | None
+    ready_s: float | None
+    up_s: float | None
+
+
+def record_of(report: Report, path: str, kind: str, at: float, run: RunFacts | None) -> Record:
+    """Return the Record of a report of the core, completed with the facts of the run."""
+    exit, error = report.exit, report.error
+    if exit is not None:
+        code = exit.code
+    else:  # a StartFailed has the code if the process died before it was ready
+        code = error.details.get("code") if isinstance(error, StartFailed) else None
+    return Record(
+        event="restarted" if report.event == "started" and run is not None and run.is_restart else report.event,
+        path=path,
+        kind=kind,
+        run=report.starts,
+        at=at,
+        state=report.state,
+        pid=None if run is None else run.pid,
+        reason="" if exit is None else exit.reason,
+        detail=_detail(report),
+        code=code,
+        signal=signal_name(-code) if code is not None and code < 0 else "",
+        traceback=_traceback(report),
+        restarts=report.restarts,
+        delay_s=report.delay_s,
+        ready_s=None if run is None else run.ready_s,
+        up_s=None if run is None or exit is None else run.up_s,
+    )
+
+
+def _detail(report: Report) -> str:
+    if report.error is not None:
+        text, wanted = text_of(report.error), wanted_by(report.error)
+        return text if wanted in text else f"{text}: {wanted}"
+    return "" if report.exit is None else report.exit.detail
+
+
+def _traceback(report: Report) -> str:
+    if report.event == "start_failed" and report.error is not None:
+        return trace_of(report.error)
+    return "" if report.exit is None else report.exit.traceback
 
 
 def _how(record: Record) -> str:

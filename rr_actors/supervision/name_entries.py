@@ -79,13 +79,14 @@ class Entries:
     def mark(self, spec: ChildSpec, path: str, status: Presence, why: str = "", turn: Turn | None = None) -> list[str]:
         """Mark a child, its registrar and all below it with a status. Return the registrars if the status is GONE.
 
-        `turn` is the child's. All below a child that is STARTING are due: it starts them one after another.
+        `turn` is the child's. All below a child that is STARTING are due: it starts them one after another. So are all
+        below one that is STOPPED and due.
         An error is logged: the directory may be gone, with the system.
         """
         try:
             for where, child in self.starting_with(spec, path):
                 self._mark_one(child, where, status, why, turn)
-                turn = Turn.DUE if status is Presence.STARTING else None
+                turn = Turn.DUE if status is Presence.STARTING or turn is Turn.DUE else None
         except RrError as error:
             logger.error("%s: could not be marked %s in the directory: %s", path, status.value, error)
         return self.registrars_of(spec, path) if status is Presence.GONE else []
@@ -131,7 +132,7 @@ class Entries:
             name = path.rpartition("/")[2]
             if status is Presence.STARTING:  # others find it by its classes: `load(Cameras.open_camera, ...)`
                 self._directory.put_classes(name, class_names(manager))
-            self._directory.mark(registrar_key(name), status, why)
+            self._directory.mark(registrar_key(name), status, why, turn if status is Presence.STOPPED else None)
 
     def check_names(self, spec: ChildSpec, path: str) -> None:
         """Check that no registrar of a new child exists already, below another supervisor or opened by hand.
@@ -151,9 +152,13 @@ class Entries:
                 text = f"start_child: {path}: a registrar {name!r} is in the system already; choose another id"
                 raise NameTaken(text, name=name)
 
-    def pid_of(self, path: str) -> int | None:
-        """Return the id of the process of the actor at `path`, as its own entry says; None if it is not up."""
-        return self._pid(actor_key(path))
+    def pid_of(self, spec: ChildSpec, path: str) -> int | None:
+        """Return the id of the process of the child at `path`, as its own entry says; None if it is not up.
+
+        A manager's registrar is up a moment before the manager itself, and its supervisor hears so later.
+        """
+        registrar = None if manager_of(spec) is None else self._pid(registrar_key(path.rpartition("/")[2]))
+        return registrar or self._pid(actor_key(path))
 
     def pids_below(self, path: str) -> list[int]:
         """Return the ids of the processes of the actors below `path`."""

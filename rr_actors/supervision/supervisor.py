@@ -41,8 +41,18 @@ from rr_actors.runtime.processes.process import check_descriptors
 from rr_actors.supervision.child_runs import Target
 from rr_actors.supervision.core import child_calls
 from rr_actors.supervision.core.child_calls import Counts
+from rr_actors.supervision.core.foreseen import Foreseen, What, foresee
 from rr_actors.supervision.core.rendering import describe_settings
-from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec, classes_of, count_processes
+from rr_actors.supervision.core.specs import (
+    ChildModel,
+    ChildSpec,
+    EndReason,
+    Seconds,
+    Supervisor,
+    as_child_spec,
+    classes_of,
+    count_processes,
+)
 from rr_actors.supervision.core.state import CallReply, ChildState, Decision, ExitSupervisor
 from rr_actors.supervision.core.transition import within
 from rr_actors.supervision.engine import Supervision
@@ -84,6 +94,35 @@ class Child(NamedTuple):
             UsageError: the child shares its process with others (placement="thread").
         """
         return self.ref.kill()
+
+    @staticmethod
+    def fails(
+        every_s: Seconds | None = None,
+        *,
+        start_s: Seconds = 0.1,
+        start_fails: float = 0.0,
+        hangs: float = 0.0,
+        stop_s: Seconds = 0.0,
+        reason: EndReason = "killed",
+    ) -> ChildModel:
+        """Return a model of a child for `rr.simulate()`: how long it starts and lives, and how it ends.
+
+        Args:
+            every_s: seconds from when it is ready to its end: a number, `rr.Exponential(mean_s)` or
+                `rr.Uniform(least_s, most_s)`, drawn for each life. Default: None, it lives for ever.
+            start_s: seconds that a start takes. Default: 0.1. Set it to what you measured.
+            start_fails: the part of its starts that fail, from 0 to 1. Default: 0.0. Raise it for a device that is
+                not always there.
+            hangs: the part of its lives at whose end it hangs instead. Its supervisor replaces it if the ChildSpec has
+                a heartbeat_s. Default: 0.0. Raise it to see what a heartbeat is worth.
+            stop_s: seconds that a stop takes. Default: 0.0. Set it for a slow on_stop.
+            reason: how it ends: "killed", "abnormal" (an exception) or "normal". Default: "killed". Set "abnormal" for
+                a child in a thread.
+
+        Raises:
+            InvalidSpec: `.field`, `.expected`, `.got`.
+        """
+        return ChildModel(every_s, start_s, start_fails, hangs, stop_s, reason)
 
 
 Answer = Callable[[CallReply], None]
@@ -180,6 +219,8 @@ class SupervisorActor(LoopActor):
                 return supervision.history.records()
             case child_calls.Question("describe"):
                 return self._describe()
+            case child_calls.Foresee(id, what):
+                return foresee(supervision.tree, id, what, time.monotonic())
             case child_calls.ChildUpdated(id, spec):
                 supervision.tree = child_calls.update_child(supervision.tree, id, spec)
                 return supervision.tree.spec
@@ -244,7 +285,7 @@ class SupervisorActor(LoopActor):
         child = child_calls.find_child(self._supervision.tree, id)
         ref = ref_to(self._supervision.path_of(id))
         life = self._supervision.life_of(id)
-        pid = None if life is None else life.pid or self._supervision.entries.pid_of(life.path)
+        pid = life.pid if life is not None else self._supervision.entries.pid_of(child.spec, ref.path or "")
         return Child(id, ref, child.spec.type, child.state, pid)
 
 
@@ -315,6 +356,14 @@ class SupervisorRef:
             NotFound: there is no such child.
         """
         return self._ask(child_calls.Question("get_childspec", self._id_of(id)))
+
+    def foresee(self, id: str, what: What) -> Foreseen:
+        """Return what would happen here if a child was killed, stopped or restarted by hand now.
+
+        Raises:
+            NotFound: the supervisor has no such child.
+        """
+        return self._ask(child_calls.Foresee(id, what))
 
     def history(self) -> Records:
         """Return the last 1000 events of the children since the supervisor's own start, oldest first, as a list."""

@@ -31,6 +31,7 @@ from rr_actors.base.errors import (
     RegistrarDown,
     RrError,
     Unavailable,
+    counted,
     shown,
 )
 from rr_actors.base.folder import Folder, make_directories
@@ -80,7 +81,7 @@ class Backup(msgspec.Struct, frozen=True):
         """Return what is there, in words for people."""
         count = len(self.registrars)
         rows = sum(sum(copy.rows.values()) for copy in self.registrars.values())
-        catalogs = f"{count} catalog{'' if count == 1 else 's'} with {rows} rows ({self.size} bytes)"
+        catalogs = f"{counted(count, 'catalog')} with {counted(rows, 'row')} ({counted(self.size, 'byte')})"
         held = f"; all held still for {self.held_s * 1000:.1f} ms" if self.held_s else ""
         return f"{where} has {catalogs} as they were at one moment{held}"
 
@@ -557,7 +558,7 @@ def _lines_of_sums(directory: Path, backup: Backup) -> list[bytes]:
     with Folder.at(directory) as folder:
         lines = folder.read(_SUMS).splitlines(keepends=True)[1:]
     if len(lines) != len(backup.files):
-        raise _damaged(directory / _SUMS, f"the checksums of {len(backup.files)} files, not of {len(lines)}")
+        raise _damaged(directory / _SUMS, f"the checksums of {counted(len(backup.files), 'file')}, not of {len(lines)}")
     return lines
 
 

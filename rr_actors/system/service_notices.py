@@ -12,6 +12,7 @@ import os
 import socket
 from collections.abc import Mapping
 
+from rr_actors.base.errors import counted
 from rr_actors.base.reporting.log import Log
 from rr_actors.runtime.thread_rules import on_loop
 
@@ -43,8 +44,7 @@ class ServiceNotices:
     def restarted(self, path: str) -> None:
         """Say that a child was started again."""
         self._restarts += 1
-        times = "1 restart" if self._restarts == 1 else f"{self._restarts:,} restarts"
-        self._send(f"STATUS=runs; {times}, the last of {path}")
+        self._send(f"STATUS=runs; {counted(self._restarts, 'restart')}, the last of {path}")
 
     def ended(self, why: str) -> None:
         """Say that the tree has ended by itself. The process may go on."""

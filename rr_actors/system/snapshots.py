@@ -1,19 +1,29 @@
-"""Snapshots: the tree and the registrars as plain data, for people, tests and tools."""
+"""Snapshots: the tree and the registrars as plain data, for people, tests and tools; and previews.
+
+A preview asks the supervisors and the registrars what they would do. Each decides that by its own core, on a copy.
+"""
 
 from __future__ import annotations
 
 import concurrent.futures
-from collections.abc import Callable, Sequence
+import os
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any, TypeVar
 
 import msgspec
 import pykka
 
-from rr_actors.base.errors import NotFound, RrError, shown
+from rr_actors.base.errors import NotFound, RrError, Unavailable, counted, few, shown, text_of
+from rr_actors.registrar.core.foretelling import End
 from rr_actors.registrar.engine.node import Node
+from rr_actors.registrar.model.rows import Notice
+from rr_actors.registrar.pages import ForeseenResource, ForeseenStatus, ForetoldPage, ResourceRow, Wanted
 from rr_actors.registrar.queries import Query, ResourceInfo
-from rr_actors.registrar.registrar import Registrar
+from rr_actors.registrar.registrar import Registrar, page
 from rr_actors.streams.stream import StreamInfo
+from rr_actors.supervision.core.foreseen import Foreseen, What
 from rr_actors.supervision.supervisor import SupervisorRef
 from rr_actors.system.registrar_lookup import registrar_in
 from rr_actors.wire.name_service import Presence
@@ -22,6 +32,9 @@ T = TypeVar("T")
 _Asked = TypeVar("_Asked")
 
 _ASKED_AT_ONCE = 16
+_PRESENT_S = 2.0  # for one supervisor or registrar to say what is there, or what it would do: it may hang
+_PRESENT = 2000
+"""The most resources of one registrar that a recording has from its beginning on."""
 
 _NO_ANSWER = (RrError, pykka.Timeout)
 """What a supervisor raises that is stopped or being respawned, or whose process does not answer in time."""
@@ -144,6 +157,51 @@ def streams_of(node: Node) -> list[StreamInfo]:
     return [stream for answer in answers if not isinstance(answer, RrError) for stream in answer]
 
 
+def present_in(node: Node, root: str | None) -> tuple[list[dict[str, Any]], list[ResourceRow], int, list[str]]:
+    """Return what is there now: all children, resources, how many more there are, and why some are not known.
+
+    Args:
+        root: the path of the root supervisor; None if it has ended.
+    """
+    tree = list[dict[str, Any]]()
+    if root is not None:
+        described = describe_supervisor(SupervisorRef(root, timeout_s=_PRESENT_S))
+        tree += _all_of(described | {"state": "running", "pid": os.getpid(), "up_s": None})
+    wanted = Wanted("resources", limit=_PRESENT)
+    answers = ask_registrars(node, lambda registrar: _soon(registrar.name, lambda: page(registrar, wanted)))
+    pages = [answer for answer in answers.values() if not isinstance(answer, RrError)]
+    resources = [row for one in pages for row in one.resources]
+    notes = [text_of(answer) for answer in answers.values() if isinstance(answer, RrError)]
+    return tree, resources, sum(one.total for one in pages) - len(resources), notes
+
+
+def _soon(name: str, ask: Callable[[], T]) -> T:
+    """Return the answer of a registrar. One that comes later is dropped, in a thread that waits for it.
+
+    Raises:
+        Unavailable: it has not answered in time.
+    """
+    answer = concurrent.futures.Future[T]()
+
+    def run() -> None:
+        try:
+            answer.set_result(ask())
+        except BaseException as error:
+            answer.set_exception(error)
+
+    threading.Thread(target=run, name="rr-actors-snapshot", daemon=True).start()
+    try:
+        return answer.result(_PRESENT_S)
+    except concurrent.futures.TimeoutError:
+        raise Unavailable(f"{name}: it has not answered within {_PRESENT_S:g} s") from None
+
+
+def _all_of(node: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    yield node
+    for child in node.get("children", ()):
+        yield from _all_of(child)
+
+
 def describe_registrar(registrar: Registrar) -> dict[str, Any]:
     """Return a registrar: its servers, its resources with their holders and dependencies, and the queries it holds."""
     queries, resources = registrar.queries(), registrar.resources()
@@ -175,3 +233,153 @@ def _describe_query(query: Query) -> dict[str, Any]:
         "state": str(query.state),
         "parent": query.parent,
     }
+
+
+# -- previews ----------------------------------------------------------------------------------------------------------
+
+
+class Preview(msgspec.Struct, frozen=True):
+    """What would happen if a child was killed, stopped or restarted now. System.preview() returns it.
+
+    The cores of the supervisors and registrars decide it on copies of their states. It assumes that each start
+    succeeds, that each callback returns what it returned before, and that no status callback deals with a status. str()
+    says it in words.
+
+    Attributes:
+        what: "kill", "stop" or "restart"; `path`: of which child.
+        supervisors: what each supervisor would do that acts, from the child's own upwards.
+        ends: whether the system would end.
+        resources: of which something would become; also those that depend on one that is lost.
+        kept: by registrar that is started again, how many of its resources would stay as they are.
+        unserved: by registrar that ends, and is not started again, how many resources nobody would serve.
+        heard: which statuses holders would hear.
+        notes: why registrars could not be asked.
+    """
+
+    what: What
+    path: str
+    supervisors: tuple[Foreseen, ...]
+    ends: bool
+    resources: tuple[ForeseenResource, ...] = ()
+    kept: dict[str, int] = {}
+    unserved: dict[str, int] = {}
+    heard: tuple[ForeseenStatus, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def sentences(self) -> list[str]:
+        """Return what would happen, a sentence for each supervisor, registrar and holder."""
+        said = [*filter(None, map(_course_text, self.supervisors))]
+        if self.ends:
+            said.append("the system would end")
+        said += [f"{counted(count, 'resource')} of {name} would stay" for name, count in self.kept.items() if count]
+        fates: dict[str, list[str]] = {}
+        for resource in self.resources:
+            fates.setdefault(resource.becomes, []).append(resource.name)
+        said += [f"would be {becomes}: {few(names)}" for becomes, names in fates.items()]
+        said += [f"{counted(n, 'resource')} of {name} would have no server" for name, n in self.unserved.items() if n]
+        hearings = dict.fromkeys((one.holder, one.state, one.name) for one in self.heard)
+        by_holder: dict[tuple[str, str], list[str]] = {}
+        for holder, state, name in hearings:
+            by_holder.setdefault((holder, state), []).append(name)
+        said += [f"{holder} would hear {state} of {few(names)}" for (holder, state), names in by_holder.items()]
+        return [*said, *self.notes]
+
+    def __str__(self) -> str:
+        return "\n".join(self.sentences())
+
+
+_ROUNDS = 100  # of statuses from one registrar to the next
+
+
+def preview_in(node: Node, root: str, path: str, what: What) -> Preview:
+    """Return what would happen if the child at a path was killed, stopped or restarted.
+
+    Raises:
+        NotFound: there is no such child.
+        ActorUnavailable, pykka.Timeout: its supervisor does not answer.
+    """
+    courses, ends = _courses(path, what)
+    below = {child["path"]: child for child in _all_of(describe_supervisor(SupervisorRef(root, timeout_s=_PRESENT_S)))}
+    ended: dict[str, End] = {}
+    comes_back: dict[str, bool] = {}
+    for course in courses:
+        for step in course.steps:
+            place = f"{course.path}/{step.id}"
+            for one in [other for other in below if f"{other}/".startswith(f"{place}/")]:
+                name = one.rpartition("/")[2]
+                if step.happens != "starts":
+                    is_crash = what == "kill" and place == path
+                    ended.setdefault(name, "crash" if is_crash else "stop")
+                comes_back[name] = step.happens == "starts"
+    return _with_registrars(node, Preview(what, path, tuple(courses), ends), ended, comes_back)
+
+
+def _courses(path: str, what: What) -> tuple[list[Foreseen], bool]:
+    """Return what each supervisor would do, from the child's own upwards, and whether the root would end."""
+    courses: list[Foreseen] = []
+    while "/" in path:
+        above, _, id = path.rpartition("/")
+        courses.append(SupervisorRef(above).foresee(id, what))
+        if not courses[-1].ends:
+            return courses, False
+        path, what = above, "kill"
+    return courses, True
+
+
+def _with_registrars(node: Node, preview: Preview, ended: dict[str, End], comes_back: dict[str, bool]) -> Preview:
+    """Return the preview with what the registrars would do that end, and those that hold something there."""
+    notes: list[str] = []
+    kept, unserved = dict[str, int](), dict[str, int]()
+    resources, heard = dict[str, ForeseenResource](), list[ForeseenStatus]()
+    ahead: dict[tuple[str, str], list[Notice]] = {}  # what is on its way, by provider and holder
+
+    def foretold(name: str, wanted: Wanted) -> ForetoldPage | None:
+        try:
+            found = _soon(name, lambda: page(registrar_in(node, name, patient=False), wanted)).foretold
+        except RrError as error:
+            notes.append(text_of(error))
+            return None
+        resources.update((one.id, one) for one in found.resources)
+        heard.extend(found.heard)
+        for notice in found.notices:
+            ahead.setdefault((name, notice.origin), []).append(notice)
+        return found
+
+    for name in [name for name, status in node.statuses().items() if status is Presence.UP and name in ended]:
+        if comes_back[name]:
+            if (found := foretold(name, Wanted("foretold", end=ended[name]))) is not None:
+                kept[name] = found.kept
+        else:
+            try:
+                registrar = registrar_in(node, name, patient=False)
+                unserved[name] = _soon(name, partial(page, registrar, Wanted("resources", limit=0))).total
+            except RrError as error:
+                notes.append(text_of(error))
+    for _ in range(_ROUNDS):
+        if not ahead:
+            break
+        (provider, holder), notices = next(iter(ahead.items()))
+        del ahead[provider, holder]
+        if comes_back.get(holder, True):
+            foretold(holder, Wanted("foretold", provider=provider, notices=tuple(notices)))
+    return msgspec.structs.replace(
+        preview,
+        resources=tuple(resources.values()),
+        kept=kept,
+        unserved=unserved,
+        heard=tuple(heard),
+        notes=tuple(notes),
+    )
+
+
+def _course_text(course: Foreseen) -> str:
+    happens: dict[str, list[str]] = {}
+    for step in course.steps:
+        happens.setdefault(step.happens, []).append(step.id)
+    happens.pop("dies", None)
+    said = [f"{few(ids)} would {verb.removesuffix('s')}" for verb, ids in happens.items()]
+    if course.restarts > course.before:
+        said.append(f"{course.restarts} of {course.max_restarts} restarts in {course.max_seconds:g} s")
+    if course.ends:
+        said.append("which is too many: it would give up" if course.error else "it would end")
+    return f"{course.path} ({course.strategy}): {', '.join(said)}" if said else ""

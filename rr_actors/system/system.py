@@ -6,9 +6,11 @@ import asyncio
 import contextlib
 import contextvars
 import functools
+import importlib
 import os
 import signal
 import threading
+import time
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -69,6 +71,7 @@ from rr_actors.runtime.workers import Workers
 from rr_actors.storage.child_records import ChildRecords
 from rr_actors.storage.opening import open_catalog, remove_catalogs
 from rr_actors.streams.stream import StreamInfo
+from rr_actors.supervision.core.foreseen import What
 from rr_actors.supervision.core.rendering import Tree
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec, classes_of
 from rr_actors.supervision.given_up import give_up
@@ -85,7 +88,7 @@ from rr_actors.system.event_subscribers import Event, Facts, Subscribers
 from rr_actors.system.recording.event_memory import EventMemory
 from rr_actors.system.recording.figures import Counters, Figure, figures_of
 from rr_actors.system.recording.recordings import LIMIT as RECORDING_LIMIT
-from rr_actors.system.recording.recordings import Recording, Recordings
+from rr_actors.system.recording.recordings import Recording, Recordings, note_present, present_entries
 from rr_actors.system.registrar_lookup import (
     give_up_clients,
     gone_and_serving,
@@ -96,15 +99,28 @@ from rr_actors.system.registrar_lookup import (
 )
 from rr_actors.system.service_notices import ServiceNotices
 from rr_actors.system.snapshots import (
+    Preview,
     ask_registrars,
     describe_at,
     describe_registrars,
     describe_supervisor,
     paths_to,
+    present_in,
+    preview_in,
     streams_of,
 )
 from rr_actors.system.web_process import WebPage, check_proxy
-from rr_actors.wire.name_service import Presence, StateDir, absolute_path, actor_key, open_state_dir, registrar_key
+from rr_actors.wire.name_service import (
+    HostInfo,
+    HostSettings,
+    OtherHosts,
+    Presence,
+    StateDir,
+    absolute_path,
+    actor_key,
+    open_state_dir,
+    registrar_key,
+)
 
 logger = Log("rr_actors")
 
@@ -154,9 +170,10 @@ class System:
             Give it one of its own: start() warns if it has other files at first.
         config: limits and defaults.
         debug: whether actors can be paused and stepped: system.mailbox(id).pause().
+        hosts: an rr.Hosts, the system's part in a group of hosts (docs/hosts.md); None: it ends at this host.
 
     Raises:
-        InvalidSpec: the tree is wrong. `.field`, `.expected`, `.got`.
+        InvalidSpec: the tree is wrong, or hosts is no rr.Hosts. `.field`, `.expected`, `.got`.
         ConfigError: state_dir is no path, or config is no SystemConfig.
     """
 
@@ -168,9 +185,14 @@ class System:
         state_dir: str | os.PathLike[str] = "rr_state",
         config: SystemConfig | None = None,
         debug: bool = False,
+        hosts: HostSettings | None = None,
     ) -> None:
         self.name = check_name(name, "system name")
         self.root = _root_of(root)
+        self._hosts: OtherHosts | None = None
+        if hosts is not None:
+            gateway = importlib.import_module("rr_actors.system.hosts.gateway")  # what few systems need
+            self.root, self._hosts = gateway.with_gateway(self.root, hosts)
         self.state_dir = state_path(state_dir)
         self.config = system_config(config)
         self.debug = debug
@@ -244,8 +266,9 @@ class System:
                 self._child_logs = KeptLogs()
                 self._dispatcher = dispatcher = acquire(workers_limit=self.config.workers_limit)
                 place = str(state.path), str(state.run_dir), state.key
+                levels = forwarded_logs.levels()
                 info = SystemInfo(
-                    self.name, *place, self.config, state.place, forwarded_logs.levels(), debug=self.debug
+                    self.name, *place, self.config, state.place, levels, debug=self.debug, hosts=self._hosts
                 )
                 self._ended = Flag()
                 self._end = None
@@ -798,6 +821,16 @@ class System:
         """Return the open streams of the whole system. A registrar that does not answer is left out."""
         return streams_of(self._running())
 
+    def hosts(self) -> list[HostInfo]:
+        """Return the other hosts that this system knows, by name: those it has seen, and those its settings name.
+
+        Raises:
+            UsageError: the system was made without hosts=.
+        """
+        if self._hosts is None:
+            raise UsageError(f"system {self.name!r}: hosts(): expected a system made with System(hosts=...)")
+        return self._hosts.known(self._running().directory)
+
     def tree(self, path: str | None = None) -> Tree:
         """Return a picture of the child at `path` and everything below it; without a path, of the whole tree.
 
@@ -888,8 +921,8 @@ class System:
             The page: its `.url`, and `.stop()`.
 
         Raises:
-            UsageError: the system does not run or has no console, the library nicegui is not installed, or an argument
-                is not valid.
+            UsageError: the system does not run or has no console, or an argument is not valid.
+            MissingDependency: the library nicegui is not installed.
             Unavailable: the page did not start; standard error says why.
         """
         check_may_block("System.serve_web()")
@@ -929,10 +962,39 @@ class System:
         self._running()
         path = None if file is None else Path(file)
         recording = Recording(self.name, limit=limit, path=path, recordings=self._recordings)
-        if self._node is None:  # the system was stopped meanwhile
+        if (node := self._node) is None:  # the system was stopped meanwhile
             recording.stop()
             self._running()
+        else:
+            present = present_in(node, None if self._end is not None else self._top)
+            note_present(recording, present_entries(*present, time.time()))
         return recording
+
+    def preview(self, *, kill: str | None = None, stop: str | None = None, restart: str | None = None) -> Preview:
+        """Return what would happen if a child was killed, stopped or restarted now; nothing is changed.
+
+        Give one of the three: the child's id, if only one has it, or its path.
+
+        Args:
+            kill: its process would be killed.
+            stop: its supervisor would stop it, as terminate_child() does.
+            restart: its supervisor would stop it, and start it again.
+
+        Raises:
+            UsageError: not one child is given, or it is the root.
+            NotFound: there is no such child, or several have the id.
+            ActorUnavailable: its supervisor does not answer now.
+        """
+        node = self._running()
+        what: What = "kill" if kill is not None else "stop" if stop is not None else "restart"
+        given = [child for child in (kill, stop, restart) if child is not None]
+        if len(given) != 1:
+            raise UsageError(f"preview: expected one of kill, stop and restart, got {len(given)}")
+        (child,) = given
+        path = self.ref(check_text(child, f"preview: {what}: expected a child's id or path")).path
+        if path is None or "/" not in path:
+            raise UsageError(f"preview: {what}: expected a child of a supervisor, got {shown(child)}")
+        return preview_in(node, self._top, path, what)
 
     def figures(self) -> list[Figure]:
         """Return the figures of the system: children, restarts, registrars, servers' loads, commits, dead letters.

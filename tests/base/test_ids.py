@@ -8,7 +8,7 @@ import uuid
 
 import pytest
 
-from rr_actors.base.names import new_id
+from rr_actors.base.names import new_id, planned_id, time_in
 
 
 def test_ids_are_uuid7_of_the_present_time() -> None:
@@ -38,3 +38,15 @@ def test_a_forked_child_repeats_no_id() -> None:
     with os.fdopen(reader) as answer:
         theirs = int(answer.read(), 16) % 2**80
     assert abs(theirs - before) > 1000
+
+
+def test_an_id_has_the_time_at_which_it_was_made() -> None:
+    for id in (new_id(), planned_id()):
+        at = time_in(id)
+        assert at is not None
+        assert abs(time.time() - at) < 60
+
+
+@pytest.mark.parametrize("id", ["", "mine", "f81d4fae7dec41d0a76500a0c91e6bf6", "0" * 12 + "7" + "0" * 19, "7" * 33])
+def test_an_id_of_another_kind_has_no_time(id: str) -> None:
+    assert time_in(id) is None

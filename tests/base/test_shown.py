@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
-from rr_actors.base.errors import shown
+from rr_actors.base.errors import counted, shown
 from rr_actors.base.names import named
 from rr_actors.registrar.core.decide import decide
 from rr_actors.registrar.model.catalog import Catalog
@@ -142,3 +142,17 @@ def test_a_name_is_not_shortened_to_save_a_few_characters() -> None:
     assert named("leases/lease", lease) == f"leases/lease {lease}"
     long = named("leases/lease", lease.replace("anna1", "anna" * 10))
     assert (len(long), long[:13], long[-6:]) == (60, "leases/lease ", 'anna"}')
+
+
+@pytest.mark.parametrize(
+    ("count", "noun", "expected"),
+    [
+        (1, "catalog", "1 catalog"),
+        (0, "query", "0 queries"),
+        (2, "more entry", "2 more entries"),
+        (2, "day", "2 days"),
+        (2000, "child process", "2,000 child processes"),
+    ],
+)
+def test_a_count_has_the_noun_in_the_form_for_it(count: int, noun: str, expected: str) -> None:
+    assert counted(count, noun) == expected

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import operator
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Self
 from unittest import mock
 
 import pytest
@@ -118,8 +118,50 @@ def test_a_declared_method_is_refused_where_its_class_is_written() -> None:
             def open(self, request: str) -> str:
                 return request
 
-            @open.unload
+            @open.unload  # type: ignore[arg-type]
             def close(self, request: str) -> None: ...
+
+
+def test_a_forgotten_self_is_said_where_the_class_is_written() -> None:
+    with pytest.raises(rr.InvalidSpec, match=r"@rr.server\('camera'\): load: expected self .*open\(self, device, "):
+
+        class OfAType(rr.Manager):
+            @rr.server("camera")  # type: ignore[arg-type]
+            def open(device: str) -> str:  # type: ignore[misc]  # noqa: N805
+                return device
+
+    with pytest.raises(rr.InvalidSpec, match=r"load: expected self as the first parameter: open\(self, request, "):
+
+        class OfAName(rr.Manager):
+            @rr.server("camera")
+            def open(request):  # type: ignore[no-untyped-def]  # noqa: N805
+                return request
+
+    with pytest.raises(rr.InvalidSpec, match=r"server 'camera': unload: expected self .*close\(self, name, "):
+
+        class InUnload(rr.Manager):
+            @rr.server("camera")
+            def open(self, name: str, port: int) -> str:
+                return name
+
+            @open.unload
+            def close(name: str, port: int, response: str) -> None: ...  # type: ignore[misc]  # noqa: N805
+
+
+def test_another_name_for_self_is_taken() -> None:
+    class Named(rr.Manager):
+        @rr.server("camera")
+        def open(this, request: str) -> str:  # noqa: N805
+            return request
+
+        @open.unload
+        def close(me: Named, request: str, response: str) -> None: ...  # noqa: N805
+
+        @open.recover
+        def again(cls: Self, request: str, response: str) -> str:  # noqa: N805
+            return response
+
+    assert Named.open.name == "camera"
 
 
 def test_a_server_declared_without_its_name_is_told_how_to_write_it() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import json
+import pydoc
 import re
 import shutil
 import subprocess
@@ -73,6 +75,31 @@ class Cameras(rr.Manager):
     def open_camera(self, device: str) -> int:
         return len(device)
 
+    @open_camera.unload  # error
+    def close_camera(self, device: str, response: str) -> None: ...
+
+    @open_camera.status  # error
+    def camera_status(self, device: str) -> None: ...
+
+    @open_camera.recover  # error
+    def recover_camera(self, device: str, response: int) -> str:
+        return device
+
+    @open_camera.usage  # error
+    def camera_usage(self, device: int, response: int) -> dict[str, float]:
+        return {}
+
+    @open_camera.health  # error
+    def camera_health(self, device: str, response: int) -> int:
+        return 0
+
+    @open_camera.pause  # error
+    def pause_camera(self, device: str) -> None: ...
+
+    @open_camera.resume  # error
+    async def resume_camera(self, device: str, response: int) -> str:
+        return device
+
     @rr.server("zoom")
     def zoom(self, device: str, factor: float = 1.0) -> int:
         return len(device)
@@ -85,6 +112,15 @@ def use(app: rr.Registrar) -> None:
     app.load("cameras/camera", "a", block=False).response  # error
     app.load(3, "a")  # error
     app.load(Cameras.zoom, "a")  # error
+    app.load(Cameras.open_camera, "a", timeout=3)  # error
+    app.load(Cameras.open_camera, "a", block=False).get().response.upper()  # error
+
+
+async def use_async(app: rr.Registrar) -> None:
+    await app.load_async(Cameras.open_camera, 3)  # error
+    (await app.load_async(Cameras.open_camera, "a")).response.upper()  # error
+    await app.load_async("cameras/camera", "a", timeout=3)  # error
+    await app.load_async(3, "a")  # error
 """
 
 PROGRAMS = ("readme.py", "use.py", "every_name.py")
@@ -133,8 +169,12 @@ COMPLETE = """
 import json, sys
 import jedi
 environment = jedi.InterpreterEnvironment()
-offered = [jedi.Script(code, environment=environment).complete() for code in json.load(sys.stdin)]
-json.dump([[found.name for found in one] for one in offered], sys.stdout)
+names, signatures = [], []
+for code in json.load(sys.stdin):  # one after the other: the next Script reads the code of the last one anew
+    script = jedi.Script(code, environment=environment)
+    names.append([found.name for found in script.complete()])
+    signatures.append([[one.name for one in found.params] for found in script.get_signatures()])
+json.dump([names, signatures], sys.stdout)
 """
 COMPLETED = {
     "app.load('cameras/camera', 1).re": {"response", "request", "registrar", "released", "resource_id"},
@@ -143,16 +183,39 @@ COMPLETED = {
     "system.open_re": {"open_registrar"},
     "rr.co": {"codec"},
 }
+OPTIONS = ["on_status", "timeout_s", "parent", "progress", "priority", "wait_s"]
 
 
-@pytest.mark.slow
-def test_completion_offers_what_there_is() -> None:
+def jedi(*lines: str) -> tuple[list[list[str]], list[list[list[str]]]]:
+    """What Jedi offers at the end of each line: the names, and the parameters of each signature."""
     before = "import rr_actors as rr\nsystem = rr.System()\napp = system.open_registrar('app')\n"
-    programs = json.dumps([before + line for line in COMPLETED])
+    programs = json.dumps([before + line for line in lines])
     # In a process of its own: here pytest has loaded rr_actors in a way that Jedi cannot read.
     ran = subprocess.run(
         [sys.executable, "-c", COMPLETE], input=programs, capture_output=True, text=True, timeout=60, check=True
     )
-    for (line, expected), offered in zip(COMPLETED.items(), map(set, json.loads(ran.stdout)), strict=True):
+    names, signatures = json.loads(ran.stdout)
+    return names, signatures
+
+
+@pytest.mark.slow
+def test_completion_offers_what_there_is() -> None:
+    names, _ = jedi(*COMPLETED)
+    for (line, expected), offered in zip(COMPLETED.items(), map(set, names), strict=True):
         assert expected <= offered, line
         assert bool(expected) == bool(offered), line
+
+
+@pytest.mark.slow
+def test_completion_shows_the_options_of_a_load_by_name() -> None:
+    _, (load, load_async) = jedi("app.load(", "app.load_async(")
+    first = ["server", "request", "response_type"]
+    assert load == [[*first, "block", *OPTIONS]] * 2
+    assert load_async == [[*first, *OPTIONS]]
+
+
+def test_help_shows_the_options_of_a_load_and_what_each_means() -> None:
+    for name in ("load", "load_async"):
+        assert set(OPTIONS) < set(inspect.signature(getattr(rr.Registrar, name)).parameters)
+    text = pydoc.render_doc(rr.Registrar.load)
+    assert all(re.search(rf"^ +{option}: \w", text, re.MULTILINE) for option in OPTIONS)

@@ -23,7 +23,7 @@ from chaos.monkey import Monkey
 from rr_actors.base.config import SystemConfig
 from rr_actors.managers import Choices, Keeper
 from rr_actors.managers.actions.graph_engine import GraphEngine
-from rr_actors.managers.actions.graph_runs import OVER, Ended, GraphRun
+from rr_actors.managers.actions.graph_runs import OVER, GraphRun, NodeEnded
 from rr_actors.managers.choices import choice_manager, trials
 from rr_actors.managers.keeper import comparing
 from rr_actors.registrar.core import holding, notices, reconciliation, recovery, releasing, status_delivery, unloading
@@ -294,7 +294,7 @@ def _planners_are_killed() -> None:
 def _ends_of_actions_are_not_written() -> None:
     def wrap(commit: Any) -> Any:
         def broken(self: GraphEngine, graph: Any, run: GraphRun, event: Any) -> None:
-            if not isinstance(event, Ended) or run.state in OVER:
+            if not isinstance(event, NodeEnded) or run.state in OVER:
                 commit(self, graph, run, event)
 
         return broken

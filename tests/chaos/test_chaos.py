@@ -33,6 +33,8 @@ from rr_actors.registrar.model.rows import Held, Hold, Notice, Phase, Resource, 
 from rr_actors.tools.inspection import Contents
 from support import TESTS, eventually
 
+pytestmark = pytest.mark.cold
+
 
 @pytest.mark.slow
 def test_twenty_kills_and_other_harm_break_no_promise(tmp_path: Path) -> None:

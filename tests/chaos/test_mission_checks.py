@@ -19,9 +19,9 @@ from chaos.mission.mission_checks import (
 from chaos.mission.mission_managers import CHOICES, DESIRED, GRAPH, STEPS, graphs_folder, write_files
 from rr_actors.base.values.canonical import encode
 from rr_actors.managers import Choose, Kept, RunAction
-from rr_actors.managers.actions.graph_documents import read_graph
+from rr_actors.managers.actions.graph_documents import feedback, read_graph
 from rr_actors.managers.actions.graph_library import GraphLibrary
-from rr_actors.managers.actions.graph_runs import Begin, decide, feedback, first_run
+from rr_actors.managers.actions.graph_runs import Begin, decide, first_run
 from rr_actors.managers.choices.chosen import Chosen
 from rr_actors.managers.keeper.desired import Replica, parse_desired
 from rr_actors.registrar.model.rows import Held, Hold, Phase, Resource, Row, State

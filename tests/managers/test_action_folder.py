@@ -204,6 +204,21 @@ def test_a_file_that_ends_the_process_is_named_and_runs_again_when_it_has_change
     assert place.said() == "two"
 
 
+def test_a_file_that_runs_when_the_process_is_killed_from_outside_is_not_blamed(
+    start: Start, tmp_path: Path, folder: Path
+) -> None:
+    place = Place(start, tmp_path)
+    assert place.said() == "one"
+    once = f"{HEAD}import time\nfrom pathlib import Path\nruns = Path({str(tmp_path)!r}) / 'runs'\n"
+    slow = "if not runs.exists():\n    runs.touch()\n    time.sleep(60)\n"
+    (folder / "tell.py").write_text(once + slow + tell("two")[len(HEAD) :])
+    with ThreadPoolExecutor() as pool:
+        saying = pool.submit(place.said)
+        assert eventually((tmp_path / "runs").exists)
+        kill(place.system, "actions")
+        assert saying.result(60) == "two"
+
+
 def test_a_file_that_is_wrong_fails_the_start(tmp_path: Path, folder: Path) -> None:
     (folder / "tell.py").write_text("1 / 0")
     with pytest.raises(rr.ConfigError, match=r"tell\.py: line 1: expected a Python file .*ZeroDivisionError") as caught:

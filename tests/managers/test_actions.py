@@ -305,6 +305,9 @@ def test_a_graph_can_be_stopped_paused_and_resumed_by_messages(robot: Robot, tmp
         assert eventually(lambda: query.response["actions"][2]["state"] == "INITIALIZED")
         assert query.response["graph_state"] == "PAUSED"
         assert lines(tmp_path) == ["noted", "began 1"]
+        (row,) = robot.messages.graph_rows().get()
+        assert (row["id"], row["state"], row["running"]) == (query.resource_id, "PAUSED", [])
+        assert (row["ended"], row["actions"]) == (2, len(query.response["actions"]))
         robot.messages.resume_graph(query.resource_id).get()
         assert eventually(lambda: query.response["graph_state"] == "FINISHED")
     (tmp_path / "go").unlink()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import re
 import resource
 import threading
 from collections.abc import Callable, Iterator
@@ -74,8 +75,10 @@ def house(start: Start) -> House:
 def test_the_command_line_shows_the_pools_and_a_question_that_is_none_is_refused(house: House) -> None:
     house.run("heater", 60)
     head, row, *rest = run_cli("budgets").stdout.splitlines()
-    assert head.split() == ["pool", "capacity", "used", "free", "waiting", "enforced", "problem"]
-    assert row.split() == ["watts", "100", "60", "40", "0", "no"]
+    assert re.split("  +", head.strip()) == [
+        *("pool", "used", "free", "by priority", "waiting", "who waits", "enforced", "problem")
+    ]
+    assert re.split("  +", row.strip()) == ["watts", "60 of 100 ██████░░░░", "40", "0: 60", "0", "no"]
     assert rest == []
     (pool,) = json.loads(run_cli("budgets", "--json").stdout)
     assert (pool["name"], pool["capacity"], pool["free"]) == ("watts", 100.0, 40.0)
@@ -83,6 +86,19 @@ def test_the_command_line_shows_the_pools_and_a_question_that_is_none_is_refused
     assert (missing.returncode, "wallet" in missing.stderr) == (2, True)
     with pytest.raises(rr.UsageError, match="budgets: expected a question to Budgets, got 'what'"):
         house.system.ref("budgets").ask("what")
+
+
+def test_the_list_of_pools_says_what_each_priority_has_and_who_waits(house: House) -> None:
+    house.run("heater", 60, priority=2)
+    lamp = house.run("lamp", 20)
+    oven = house.run("oven", 40, wait_s=60, block=False)
+    assert eventually(lambda: json.loads(run_cli("budgets", "--json").stdout)[0]["waiting"] == 1)
+    (pool,) = json.loads(run_cli("budgets", "--json").stdout)
+    assert pool["by_priority"] == {"2": 60.0, "0": 20.0}
+    assert len(pool["who_waits"]) == 1
+    assert "by priority 2: 60, 0: 20" in run_cli("plans", "--wide").stdout
+    lamp.unload()
+    assert oven.get(timeout=60).response == "oven"
 
 
 def test_shares_are_admitted_while_they_fit_and_given_back(house: House) -> None:

@@ -8,21 +8,29 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rr_actors.managers.pipes.chains import LEAST_TRUST, Goal, Link, Step, best_chain, substitutes, why_none
+from rr_actors.managers.pipes.chains import (
+    LEAST_TRUST,
+    ChainComponent,
+    Goal,
+    PipeStep,
+    best_chain,
+    substitutes,
+    why_none,
+)
 
 TYPES = "abcd"
 
 
-def link(name: str, inputs: str = "", outputs: str = "", trust: float = 1.0, type: str = "") -> Link:
+def link(name: str, inputs: str = "", outputs: str = "", trust: float = 1.0, type: str = "") -> ChainComponent:
     """A component; each letter is a type of data."""
-    return Link(name, type or name, frozenset(inputs), frozenset(outputs), trust)
+    return ChainComponent(name, type or name, frozenset(inputs), frozenset(outputs), trust)
 
 
-def step(type: str, inputs: str = "", outputs: str = "") -> Step:
-    return Step(type, frozenset(inputs), frozenset(outputs))
+def step(type: str, inputs: str = "", outputs: str = "") -> PipeStep:
+    return PipeStep(type, frozenset(inputs), frozenset(outputs))
 
 
-def names(chain: tuple[Link, ...] | list[Link] | None) -> list[str] | None:
+def names(chain: tuple[ChainComponent, ...] | list[ChainComponent] | None) -> list[str] | None:
     return None if chain is None else [one.name for one in chain]
 
 
@@ -47,7 +55,7 @@ def names(chain: tuple[Link, ...] | list[Link] | None) -> list[str] | None:
         ([link("camera", "", "a", 0.0)], ["camera"]),
     ],
 )
-def test_the_best_chain_that_ends_in_what_is_asked_for(links: list[Link], chosen: list[str] | None) -> None:
+def test_the_best_chain_that_ends_in_what_is_asked_for(links: list[ChainComponent], chosen: list[str] | None) -> None:
     assert names(best_chain(links, Goal("a"))) == chosen
 
 
@@ -80,7 +88,7 @@ WAY = (step("camera", "", "b"), step("tracker", "b", "a"))
     ],
 )
 def test_a_described_pipe_has_one_component_for_each_segment(
-    links: list[Link], ways: list[tuple[Step, ...]], chosen: list[str] | None
+    links: list[ChainComponent], ways: list[tuple[PipeStep, ...]], chosen: list[str] | None
 ) -> None:
     assert names(best_chain(links, Goal("tags", tuple(ways)))) == chosen
 
@@ -129,7 +137,7 @@ def test_a_substitute_fits_both_neighbours_and_is_in_no_other_place() -> None:
         ),
     ],
 )
-def test_why_there_is_no_chain(links: list[Link], goal: Goal, says: list[str]) -> None:
+def test_why_there_is_no_chain(links: list[ChainComponent], goal: Goal, says: list[str]) -> None:
     assert best_chain(links, goal) is None
     assert why_none(links, goal) == says
 
@@ -139,13 +147,13 @@ def test_why_there_is_no_chain(links: list[Link], goal: Goal, says: list[str]) -
 Letters = st.frozensets(st.sampled_from(TYPES), max_size=2)
 Trust = st.sampled_from([0.0, 0.25, 0.3, 0.5, 0.9, 1.0]) | st.floats(0, 1)
 Links = st.lists(st.tuples(st.sampled_from("xyz"), Letters, Letters, Trust), max_size=6).map(
-    lambda rows: [Link(f"{i}", *row) for i, row in enumerate(rows)]
+    lambda rows: [ChainComponent(f"{i}", *row) for i, row in enumerate(rows)]
 )
-Steps = st.builds(Step, st.sampled_from("xyz"), Letters, Letters)
+Steps = st.builds(PipeStep, st.sampled_from("xyz"), Letters, Letters)
 Ways = st.lists(st.lists(Steps, min_size=1, max_size=3).map(tuple), max_size=2).map(tuple)
 
 
-def all_chains(links: list[Link], goal: Goal) -> list[tuple[Link, ...]]:
+def all_chains(links: list[ChainComponent], goal: Goal) -> list[tuple[ChainComponent, ...]]:
     """Every chain that the rules allow, by trying every row of components."""
     if goal.ways:
         rows = [
@@ -163,7 +171,7 @@ def all_chains(links: list[Link], goal: Goal) -> list[tuple[Link, ...]]:
     return [row for row in rows if is_chain(row)]
 
 
-def is_chain(row: tuple[Link, ...]) -> bool:
+def is_chain(row: tuple[ChainComponent, ...]) -> bool:
     for place, one in enumerate(row):
         given = row[place - 1].outputs if place else frozenset[str]()
         if bool(one.inputs) != bool(place) or one.inputs - given:
@@ -171,7 +179,7 @@ def is_chain(row: tuple[Link, ...]) -> bool:
     return True
 
 
-def rank(chain: tuple[Link, ...], links: list[Link]) -> tuple[object, ...]:
+def rank(chain: tuple[ChainComponent, ...], links: list[ChainComponent]) -> tuple[object, ...]:
     """The less the better. Whole numbers are exact, where products of floats are rounded."""
     above, below = 1, 1
     for one in chain:
@@ -198,7 +206,7 @@ class _Ratio:
 @settings(max_examples=200, deadline=None)
 @given(Links, st.sampled_from(TYPES), Ways)
 def test_the_chosen_chain_is_the_best_by_brute_force(
-    links: list[Link], of_type: str, ways: tuple[tuple[Step, ...], ...]
+    links: list[ChainComponent], of_type: str, ways: tuple[tuple[PipeStep, ...], ...]
 ) -> None:
     goal = Goal(of_type, ways)
     every = all_chains(links, goal)
@@ -211,7 +219,7 @@ def test_the_chosen_chain_is_the_best_by_brute_force(
 @settings(max_examples=200, deadline=None)
 @given(Links, st.sampled_from(TYPES), Ways, st.data())
 def test_the_substitutes_are_those_with_which_the_chain_is_one(
-    links: list[Link], of_type: str, ways: tuple[tuple[Step, ...], ...], data: st.DataObject
+    links: list[ChainComponent], of_type: str, ways: tuple[tuple[PipeStep, ...], ...], data: st.DataObject
 ) -> None:
     goal = Goal(of_type, ways)
     every = all_chains(links, goal)

@@ -12,7 +12,7 @@ from rr_actors.managers.choices.planning import (
     RETRY_LEAST_S,
     RETRY_LIMIT_S,
     UNKNOWN,
-    Choice,
+    ChoiceState,
     Plan,
     Standing,
     failed,
@@ -31,19 +31,19 @@ def on_trial(since: float) -> Standing:
 @pytest.mark.parametrize(
     ("choice", "better"),
     [
-        (Choice(("a", "b", "c"), "a"), ()),
-        (Choice(("a", "b", "c"), "c"), ("a", "b")),
-        (Choice(("a", "b", "c"), "b", failing=True), ("a", "c")),
-        (Choice(("a", "b", "c"), "c", frozenset({"a"})), ("b",)),
-        (Choice(("a", "b"), "gone"), ("a", "b")),  # the file does not name it any more
-        (Choice((), "gone"), ()),
+        (ChoiceState(("a", "b", "c"), "a"), ()),
+        (ChoiceState(("a", "b", "c"), "c"), ("a", "b")),
+        (ChoiceState(("a", "b", "c"), "b", failing=True), ("a", "c")),
+        (ChoiceState(("a", "b", "c"), "c", frozenset({"a"})), ("b",)),
+        (ChoiceState(("a", "b"), "gone"), ("a", "b")),  # the file does not name it any more
+        (ChoiceState((), "gone"), ()),
     ],
 )
-def test_what_would_be_better(choice: Choice, better: tuple[str, ...]) -> None:
+def test_what_would_be_better(choice: ChoiceState, better: tuple[str, ...]) -> None:
     assert choice.better() == better
 
 
-CHOICE = Choice(("a", "b", "c"), "c")
+CHOICE = ChoiceState(("a", "b", "c"), "c")
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,7 @@ def test_what_is_done_now(standings: dict[str, Standing], expected: Plan) -> Non
 
 
 def test_one_trial_serves_all_choices() -> None:
-    choices = {"x": Choice(("a", "b"), "b"), "y": Choice(("a", "c"), "c"), "z": Choice(("b", "a"), "b")}
+    choices = {"x": ChoiceState(("a", "b"), "b"), "y": ChoiceState(("a", "c"), "c"), "z": ChoiceState(("b", "a"), "b")}
     assert plan(choices, {}, NOW, SETTLE_S).load == ("a",)
     assert plan(choices, {"a": on_trial(0)}, NOW, SETTLE_S).take == {"x": "a", "y": "a"}
 
@@ -109,7 +109,7 @@ STANDINGS = st.dictionaries(
 CHOICES = st.dictionaries(
     st.sampled_from("xyz"),
     st.builds(
-        Choice,
+        ChoiceState,
         st.permutations(KEYS).map(lambda keys: tuple(keys[:3])),
         st.sampled_from(KEYS),
         st.frozensets(st.sampled_from(KEYS), max_size=2),
@@ -121,7 +121,7 @@ CHOICES = st.dictionaries(
 @settings(max_examples=300, deadline=None)
 @given(choices=CHOICES, standings=STANDINGS)
 def test_a_plan_takes_the_best_that_has_settled_and_leaves_no_trial_that_nobody_wants(
-    choices: dict[str, Choice], standings: dict[str, Standing]
+    choices: dict[str, ChoiceState], standings: dict[str, Standing]
 ) -> None:
     made = plan(choices, standings, NOW, SETTLE_S)
     wanted = {key for choice in choices.values() for key in choice.better()}

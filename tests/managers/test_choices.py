@@ -956,6 +956,18 @@ def test_a_choice_that_is_one_of_several_is_named_by_its_id(start: Start) -> Non
 
 
 @pytest.mark.usefixtures("runtime_dir")
+def test_the_list_of_choices_says_why_a_better_one_was_passed_over(start: Start) -> None:
+    world = ByHand(start, settle_s=60.0)
+    world.broken = {"camera"}
+    assert world.choose().response.server == "sensors/lidar"
+    (row,) = json.loads(run_cli("choices", "--json").stdout)
+    ((passed, why),) = row["passed_over"].items()
+    assert (passed, row["present"]) == ('sensors/camera "front"', 'sensors/lidar "front"')
+    assert "OSError" in why
+    assert 'sensors/camera "front": ' in run_cli("plans", "--wide").stdout
+
+
+@pytest.mark.usefixtures("runtime_dir")
 def test_the_command_line_chooses_and_says_what_is_chosen(start: Start) -> None:
     def said(*arguments: object, code: int = 0) -> str:
         ran = run_cli(*arguments)

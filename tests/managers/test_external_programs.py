@@ -26,7 +26,14 @@ import pytest
 from chaos.process_census import stands
 from rr_actors.managers import external_programs, shim
 from rr_actors.managers.exit_watcher import ExitWatcher, ProcessHandle
-from rr_actors.managers.external_programs import TAIL_LINES, Exit, ExternalPrograms, Order, ProgramFailed, Running
+from rr_actors.managers.external_programs import (
+    TAIL_LINES,
+    ExternalPrograms,
+    Order,
+    ProgramExit,
+    ProgramFailed,
+    RunningProgram,
+)
 from rr_actors.managers.process_marks import VARIABLE, find_processes, kill_allocation
 from rr_actors.managers.program_directory import Home
 from rr_actors.runtime.processes.control_groups import ControlGroup, ControlGroups
@@ -56,15 +63,15 @@ class Exits:
     """Collects what on_exit is told."""
 
     def __init__(self) -> None:
-        self.seen: list[tuple[str, Exit]] = []
+        self.seen: list[tuple[str, ProgramExit]] = []
         self._changed = threading.Condition()
 
-    def __call__(self, key: str, exit: Exit) -> None:
+    def __call__(self, key: str, exit: ProgramExit) -> None:
         with self._changed:
             self.seen.append((key, exit))
             self._changed.notify_all()
 
-    def wait(self, count: int = 1) -> tuple[str, Exit]:
+    def wait(self, count: int = 1) -> tuple[str, ProgramExit]:
         """The exit that was the `count`th to be heard of."""
         with self._changed:
             assert self._changed.wait_for(lambda: len(self.seen) >= count, 10), "no exit was heard of"
@@ -170,7 +177,7 @@ def test_a_start_without_free_descriptors_leaves_no_descriptor_and_no_shim(
 def test_a_program_that_ends_before_it_is_ready_fails_with_code_and_output(programs: ExternalPrograms) -> None:
     with pytest.raises(ProgramFailed, match=r"(?s)not ready yet and exited with code 3.*no such device") as caught:
         programs.start(KEY, python("print('no such device'); raise SystemExit(3)", ready="ready"))
-    assert caught.value.exit == Exit(3, None, ("no such device",))
+    assert caught.value.exit == ProgramExit(3, None, ("no such device",))
 
 
 def test_a_program_that_is_not_ready_in_time_is_ended(
@@ -216,7 +223,7 @@ def test_an_unexpected_end_is_heard_of_with_signal_and_output_within_50_ms(
         took.append(time.monotonic() - began)
     assert min(took) < 0.05
     _, exit = exits.wait()
-    assert exit == Exit(None, 9, ("ready", "last words"))
+    assert exit == ProgramExit(None, 9, ("ready", "last words"))
     assert "signal 9 (SIGKILL)" in str(exit)
     assert "last words" in str(exit)
 
@@ -361,7 +368,7 @@ while not os.path.exists({str(go)!r}): time.sleep(0.005)
 raise SystemExit(3)"""
     programs.start(KEY, python(code, ready="ready"))
     go.touch()
-    assert exits.wait() == (KEY, Exit(3, None, ("ready",)))
+    assert exits.wait() == (KEY, ProgramExit(3, None, ("ready",)))
     kill_allocation(KEY)
 
 
@@ -477,7 +484,7 @@ def test_a_program_outlives_its_manager_and_is_attached_to_again(
     assert running.pid == pid
     assert is_running(pid)
     os.kill(pid, signal.SIGTERM)
-    assert exits.wait() == (KEY, Exit(None, 15, ("ready",)))
+    assert exits.wait() == (KEY, ProgramExit(None, 15, ("ready",)))
 
 
 def test_a_program_that_ended_while_there_was_no_manager_has_left_its_exit_code(
@@ -492,7 +499,7 @@ def test_a_program_that_ended_while_there_was_no_manager_has_left_its_exit_code(
     eventually(lambda: not shims(tmp_path))
     with pytest.raises(ProgramFailed, match=r"(?s)exited with code 42.*bye") as caught:
         programs.attach(KEY)
-    assert caught.value.exit == Exit(42, None, ("ready", "bye"))
+    assert caught.value.exit == ProgramExit(42, None, ("ready", "bye"))
 
 
 def test_a_program_that_has_ended_is_not_attached_to_while_its_shim_is_still_there(
@@ -708,7 +715,7 @@ def test_killing_the_shim_ends_the_program_and_its_children_and_is_heard_of(
     programs.start(KEY, python(code, ready="ready"))
     (shim,) = shims(tmp_path)
     shim.kill()
-    assert exits.wait()[1] == Exit(None, None, ("ready",))
+    assert exits.wait()[1] == ProgramExit(None, None, ("ready",))
     assert not find_processes(VARIABLE, KEY)
 
 
@@ -727,7 +734,7 @@ def test_a_state_that_a_full_disk_did_not_take_is_written_when_it_has_room(
 ) -> None:
     code = f"import sys; sys.stdin = open(sys.argv[1]); sys.stdin.readline(); {SLEEP}"
     os.mkfifo(tmp_path / "go")
-    home, started = tmp_path / "programs" / KEY, Future[Running]()
+    home, started = tmp_path / "programs" / KEY, Future[RunningProgram]()
 
     def start() -> None:
         started.set_result(programs.start(KEY, python(code, str(tmp_path / "go"), ready="ready"), timeout_s=30))

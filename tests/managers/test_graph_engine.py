@@ -12,7 +12,7 @@ import rr_actors as rr
 from rr_actors.managers.actions.graph_documents import read_graph
 from rr_actors.managers.actions.graph_engine import GraphEngine
 from rr_actors.managers.actions.graph_library import Shelf
-from rr_actors.managers.actions.graph_runs import Begin, Ended, first_run
+from rr_actors.managers.actions.graph_runs import Begin, NodeEnded, first_run
 from support import Calls, eventually
 
 GRAPH = read_graph(
@@ -61,8 +61,8 @@ class FakeManager:
 
     def wait_over(self, actor: str, key: str) -> None: ...
 
-    def end_of(self, query: Any, node: str, run: Any) -> Ended:
-        return Ended(node, run.number, "on_true")
+    def end_of(self, query: Any, node: str, run: Any) -> NodeEnded:
+        return NodeEnded(node, run.number, "on_true")
 
 
 def has_ended(manager: FakeManager) -> Callable[[], bool]:

@@ -13,7 +13,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.managers import Actions, RunGraph, run_graph
 from rr_actors.managers.actions.graph_log import GraphLog, logged
-from rr_actors.managers.actions.graph_runs import Ended
+from rr_actors.managers.actions.graph_runs import NodeEnded
 from support import eventually, kill, wait_respawned
 
 Start = Callable[..., rr.System]
@@ -115,13 +115,13 @@ def test_a_graph_with_a_damaged_log_is_lost_by_name_and_one_without_leaves_none(
 
 
 ENDS = [
-    Ended("A_0", 1, "on_true", {"path": Path("/a"), "raw": b"abc", "many": {1, 2}}),
-    Ended("B_0", 3, "on_false", {"when": datetime.date(2026, 11, 28)}),
-    Ended("C_0", 2, "on_error", {}, "it broke"),
+    NodeEnded("A_0", 1, "on_true", {"path": Path("/a"), "raw": b"abc", "many": {1, 2}}),
+    NodeEnded("B_0", 3, "on_false", {"when": datetime.date(2026, 11, 28)}),
+    NodeEnded("C_0", 2, "on_error", {}, "it broke"),
 ]
 
 
-def log_of(directory: Path, ends: list[Ended] = ENDS, first: int = 5) -> GraphLog:
+def log_of(directory: Path, ends: list[NodeEnded] = ENDS, first: int = 5) -> GraphLog:
     log = GraphLog(directory, "g")
     for step, end in enumerate(ends, first):
         assert log.append(step, end)
@@ -145,9 +145,9 @@ def test_a_cleared_log_begins_anew(tmp_path: Path) -> None:
 
 
 def test_a_long_end_is_for_the_response(tmp_path: Path) -> None:
-    assert not GraphLog(tmp_path, "g").append(1, Ended("A_0", 1, "on_true", {"x": b"x" * 20_000}))
+    assert not GraphLog(tmp_path, "g").append(1, NodeEnded("A_0", 1, "on_true", {"x": b"x" * 20_000}))
     with pytest.raises(rr.NotSerializable):
-        GraphLog(tmp_path, "g").append(1, Ended("A_0", 1, "on_true", {"x": object()}))
+        GraphLog(tmp_path, "g").append(1, NodeEnded("A_0", 1, "on_true", {"x": object()}))
     assert logged(tmp_path) == set()
 
 

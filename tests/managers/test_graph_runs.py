@@ -20,10 +20,10 @@ from rr_actors.managers.actions.graph_runs import (
     OVER,
     Begin,
     Change,
-    Effect,
-    Ended,
     GraphRun,
     Halt,
+    NodeEffect,
+    NodeEnded,
     Pause,
     Restored,
     Resume,
@@ -60,7 +60,7 @@ class Player:
     """Plays a graph, with the ends of actions as they are told."""
 
     def __init__(self, graph: ActionGraph, **inputs: Any) -> None:
-        self.graph, self.run, self.said = graph, first_run(graph), list[Effect]()
+        self.graph, self.run, self.said = graph, first_run(graph), list[NodeEffect]()
         self.tell(Begin(inputs))
 
     def tell(self, event: Any) -> list[str]:
@@ -72,7 +72,7 @@ class Player:
 
     def ends(self, node: str, result: str = "on_true", **outputs: Any) -> list[str]:
         name = f"{node}_0"
-        return self.tell(Ended(name, self.run.node(name).number, result, outputs, "it broke"))
+        return self.tell(NodeEnded(name, self.run.node(name).number, result, outputs, "it broke"))
 
     def state(self, node: str) -> str:
         return self.run.nodes[f"{node}_0"].state
@@ -80,7 +80,7 @@ class Player:
 
 def test_a_sequence_runs_one_after_another_and_ends_with_its_exit() -> None:
     player = Player(graph_of([("a", "b"), ("b", "c")]))
-    assert player.said == [Effect("run", "a_0")]
+    assert player.said == [NodeEffect("run", "a_0")]
     assert player.ends("a") == ["run b"]
     assert player.ends("b") == ["run c"]
     assert player.run.state == "RUNNING"
@@ -294,10 +294,10 @@ def test_a_crash_makes_what_ran_run_again_but_not_for_ever() -> None:
 
 def test_an_end_is_heard_once() -> None:
     player = Player(graph_of([("a", "b")]))
-    end = Ended("a_0", 1, "on_true")
+    end = NodeEnded("a_0", 1, "on_true")
     assert player.tell(end) == ["run b"]
     assert player.tell(end) == []
-    assert player.tell(Ended("b_0", 7, "on_true")) == []
+    assert player.tell(NodeEnded("b_0", 7, "on_true")) == []
 
 
 # -- another graph -------------------------------------------------------------------------------------------------
@@ -341,7 +341,7 @@ def test_what_runs_otherwise_than_the_new_graph_says_begins_again_with_what_it_w
     assert player.ends("b", "on_error") == ["run b"]
     assert player.run.nodes["b_0"].inputs == {"x": "given", "y": "newer"}
     assert player.run.nodes["b_0"].number > first.number
-    assert player.tell(Ended("b_0", first.number, "on_true")) == []
+    assert player.tell(NodeEnded("b_0", first.number, "on_true")) == []
     assert player.ends("b") == ["run c"]
 
 
@@ -550,13 +550,13 @@ def test_whatever_happens_the_run_is_one_that_can_be(graph: ActionGraph, data: s
         name = data.draw(st.sampled_from(sorted(graph.nodes)))
         result = data.draw(st.sampled_from(["on_true", "on_false", "on_error"]))
         live = tuple(one for one, node in before.nodes.items() if node.state in LIVE)
-        end = Ended(name, before.nodes[name].number, result)
+        end = NodeEnded(name, before.nodes[name].number, result)
         player.said.clear()
         player.tell(data.draw(st.sampled_from([end, end, end, Pause(), Resume(), Halt(), Restored(live), Begin()])))
         check(before, player.run, player.said)
 
 
-def check(before: GraphRun, after: GraphRun, effects: list[Effect]) -> None:
+def check(before: GraphRun, after: GraphRun, effects: list[NodeEffect]) -> None:
     live = {name for name, node in after.nodes.items() if node.state in LIVE}
     if after.state in OVER:
         assert live == set()
@@ -600,7 +600,7 @@ def test_whenever_a_graph_is_changed_what_runs_is_in_it_and_what_has_ended_runs_
         events: list[Any] = [Pause(), Resume(), Restored(tuple(live)), *[Change(related(draw, 5))] * 3]
         if before.state not in OVER and live:
             name = draw(st.sampled_from(live))
-            events += [Ended(name, before.node(name).number, draw(st.sampled_from(RESULTS)))] * 5
+            events += [NodeEnded(name, before.node(name).number, draw(st.sampled_from(RESULTS)))] * 5
         event = draw(st.sampled_from(events))
         if isinstance(event, Change) and draw(st.booleans()):
             event = Change(event.graph, draw(st.sampled_from(sorted(event.graph.nodes))))
@@ -617,7 +617,7 @@ def test_whenever_a_graph_is_changed_what_runs_is_in_it_and_what_has_ended_runs_
         assert not any(after.nodes[name].state in LIVE for name in after.leaving if name in after.nodes)
         if after.leaving:  # nothing begins beside what is to end
             assert all(after.node(name).attempt > 1 for name in runs)
-        if isinstance(event, Ended):
+        if isinstance(event, NodeEnded):
             ended[event.node] = event.number
         for name in runs:
             assert after.nodes[name].state in LIVE

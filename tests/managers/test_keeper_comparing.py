@@ -11,58 +11,68 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from rr_actors import Backoff, State
-from rr_actors.managers.keeper.comparing import Report, Seen, Slot, Steps, Wanted, compare, report
+from rr_actors.managers.keeper.comparing import (
+    KeptReport,
+    ReplicaSteps,
+    SeenReplica,
+    Slot,
+    WantedReplica,
+    compare,
+    report,
+)
 from rr_actors.managers.planning.setbacks import Setback, next_setback
 from support_steps import steps_of
 
 BACKOFF = Backoff(1.0, 2.0, 10.0, 0.0)
 FAILED = {("a", 0): Setback(1, 5.0, "failing", "no fuel")}
-A = Wanted("a", 0, b"a0")
-HELD = Seen("a", 0, b"a0", "held", "q")
-OLD = Seen("a", 0, b"old", "held", "q")
+A = WantedReplica("a", 0, b"a0")
+HELD = SeenReplica("a", 0, b"a0", "held", "q")
+OLD = SeenReplica("a", 0, b"old", "held", "q")
 
 
-def seen(one: Seen, **changes: object) -> Seen:
+def seen(one: SeenReplica, **changes: object) -> SeenReplica:
     return msgspec.structs.replace(one, **changes)
 
 
 LOADING, RELEASING, ENDING = (seen(HELD, phase=phase) for phase in ("loading", "releasing", "ending"))
-TABLE: list[tuple[list[Wanted], list[Seen], dict[Slot, Setback], Steps]] = [
-    ([A], [], {}, Steps(load=[A])),
-    ([A], [HELD], {}, Steps()),
-    ([A], [LOADING], {}, Steps()),
+TABLE: list[tuple[list[WantedReplica], list[SeenReplica], dict[Slot, Setback], ReplicaSteps]] = [
+    ([A], [], {}, ReplicaSteps(load=[A])),
+    ([A], [HELD], {}, ReplicaSteps()),
+    ([A], [LOADING], {}, ReplicaSteps()),
     # it is loaded again when its time has come
-    ([A], [], FAILED, Steps(next_at=5.0)),
-    ([A], [], {("a", 0): Setback(1, 4.0, "failing")}, Steps(load=[A])),
+    ([A], [], FAILED, ReplicaSteps(next_at=5.0)),
+    ([A], [], {("a", 0): Setback(1, 4.0, "failing")}, ReplicaSteps(load=[A])),
     # what is lost, or is another thing than is wanted, goes before the new one comes
-    ([A], [seen(HELD, state=State.FATAL)], FAILED, Steps(release=[seen(HELD, state=State.FATAL)])),
-    ([A], [seen(HELD, state=State.ERROR)], {}, Steps()),
-    ([A], [RELEASING], {}, Steps()),
-    ([A], [OLD], {}, Steps(release=[OLD])),
-    ([A], [seen(OLD, phase="loading")], {}, Steps(withdraw=[seen(OLD, phase="loading")])),
-    ([A], [seen(OLD, phase="ending")], {}, Steps()),
-    ([A], [ENDING], {}, Steps(load=[A])),  # the registrar answers such a load after the end
-    ([A], [seen(OLD, not_before=9.0)], {}, Steps(next_at=9.0)),
+    ([A], [seen(HELD, state=State.FATAL)], FAILED, ReplicaSteps(release=[seen(HELD, state=State.FATAL)])),
+    ([A], [seen(HELD, state=State.ERROR)], {}, ReplicaSteps()),
+    ([A], [RELEASING], {}, ReplicaSteps()),
+    ([A], [OLD], {}, ReplicaSteps(release=[OLD])),
+    ([A], [seen(OLD, phase="loading")], {}, ReplicaSteps(withdraw=[seen(OLD, phase="loading")])),
+    ([A], [seen(OLD, phase="ending")], {}, ReplicaSteps()),
+    ([A], [ENDING], {}, ReplicaSteps(load=[A])),  # the registrar answers such a load after the end
+    ([A], [seen(OLD, not_before=9.0)], {}, ReplicaSteps(next_at=9.0)),
     # nothing is wanted
-    ([], [HELD], {}, Steps(release=[HELD])),
-    ([], [LOADING], {}, Steps(withdraw=[LOADING])),
-    ([], [RELEASING, ENDING], {}, Steps()),
+    ([], [HELD], {}, ReplicaSteps(release=[HELD])),
+    ([], [LOADING], {}, ReplicaSteps(withdraw=[LOADING])),
+    ([], [RELEASING, ENDING], {}, ReplicaSteps()),
     # another priority
-    ([Wanted("a", 0, b"a0", 5)], [HELD], {}, Steps(prioritise=[(HELD, 5)])),
-    ([Wanted("a", 0, b"a0", None)], [HELD], {}, Steps(prioritise=[(HELD, None)])),
+    ([WantedReplica("a", 0, b"a0", 5)], [HELD], {}, ReplicaSteps(prioritise=[(HELD, 5)])),
+    ([WantedReplica("a", 0, b"a0", None)], [HELD], {}, ReplicaSteps(prioritise=[(HELD, None)])),
     # one of two that are equal is too many
-    ([A], [HELD, seen(HELD, id="r")], {}, Steps(release=[seen(HELD, id="r")])),
+    ([A], [HELD, seen(HELD, id="r")], {}, ReplicaSteps(release=[seen(HELD, id="r")])),
 ]
 
 
 @pytest.mark.parametrize(("wanted", "there", "failures", "steps"), TABLE)
-def test_the_steps(wanted: list[Wanted], there: list[Seen], failures: dict[Slot, Setback], steps: Steps) -> None:
+def test_the_steps(
+    wanted: list[WantedReplica], there: list[SeenReplica], failures: dict[Slot, Setback], steps: ReplicaSteps
+) -> None:
     assert compare(wanted, there, failures, 4.0) == steps
 
 
 def test_what_is_after_another_is_loaded_when_all_of_that_is_ready() -> None:
-    b = Wanted("b", 0, b"b0", 0, ("a",))
-    second = Wanted("a", 1, b"a1")
+    b = WantedReplica("b", 0, b"b0", 0, ("a",))
+    second = WantedReplica("a", 1, b"a1")
     held = seen(HELD, instance=1, what=b"a1", id="r")
 
     assert compare([A, second, b], [HELD], {}, 0.0).load == [second]
@@ -70,7 +80,7 @@ def test_what_is_after_another_is_loaded_when_all_of_that_is_ready() -> None:
     assert compare([A, second, b], [HELD, held], {}, 0.0).load == [b]
     assert compare([b], [], {}, 0.0).load == [b]  # none of "a" is wanted
     there = seen(HELD, keep="b", what=b"b0", id="s")
-    assert compare([A, b], [there], {}, 0.0) == Steps(load=[A])  # what is there stays
+    assert compare([A, b], [there], {}, 0.0) == ReplicaSteps(load=[A])  # what is there stays
 
 
 def test_the_last_of_the_file_is_released_first() -> None:
@@ -79,38 +89,38 @@ def test_the_last_of_the_file_is_released_first() -> None:
 
 
 ERROR = seen(HELD, state=State.ERROR, message="health: no answer")
-REASONS: list[tuple[list[Seen], dict[Slot, Setback], Report]] = [
-    ([HELD], FAILED, Report("a", 1, 1)),
-    ([seen(HELD, state=State.WARNING)], {}, Report("a", 1, 1)),
-    ([], {}, Report("a", 1, 0, "loading")),
-    ([LOADING], {}, Report("a", 1, 0, "loading")),
-    ([LOADING], FAILED, Report("a", 1, 0, "all failing", "no fuel", True)),
-    ([seen(LOADING, is_slow=True)], FAILED, Report("a", 1, 0, "loading")),
-    ([], {("a", 0): Setback(1, 5.0, "none registered", "x")}, Report("a", 1, 0, "none registered", "x", True)),
-    ([], {("a", 0): Setback(1, 5.0, "over capacity", "x")}, Report("a", 1, 0, "over capacity", "x", True)),
-    ([ERROR], {}, Report("a", 1, 0, "all failing", "health: no answer", True)),
+REASONS: list[tuple[list[SeenReplica], dict[Slot, Setback], KeptReport]] = [
+    ([HELD], FAILED, KeptReport("a", 1, 1)),
+    ([seen(HELD, state=State.WARNING)], {}, KeptReport("a", 1, 1)),
+    ([], {}, KeptReport("a", 1, 0, "loading")),
+    ([LOADING], {}, KeptReport("a", 1, 0, "loading")),
+    ([LOADING], FAILED, KeptReport("a", 1, 0, "all failing", "no fuel", True)),
+    ([seen(LOADING, is_slow=True)], FAILED, KeptReport("a", 1, 0, "loading")),
+    ([], {("a", 0): Setback(1, 5.0, "none registered", "x")}, KeptReport("a", 1, 0, "none registered", "x", True)),
+    ([], {("a", 0): Setback(1, 5.0, "over capacity", "x")}, KeptReport("a", 1, 0, "over capacity", "x", True)),
+    ([ERROR], {}, KeptReport("a", 1, 0, "all failing", "health: no answer", True)),
 ]
 
 
 @pytest.mark.parametrize(("there", "failures", "expected"), REASONS)
-def test_the_reasons(there: list[Seen], failures: dict[Slot, Setback], expected: Report) -> None:
+def test_the_reasons(there: list[SeenReplica], failures: dict[Slot, Setback], expected: KeptReport) -> None:
     assert report(["a"], [A], there, failures) == {"a": expected}
 
 
 def test_several_reasons_are_named_once_each() -> None:
-    replicas = [Wanted("a", i, b"") for i in range(5)]
+    replicas = [WantedReplica("a", i, b"") for i in range(5)]
     failures = {("a", i): Setback(1, 5.0, why) for i, why in enumerate(["failing", "failing", "over capacity"])}
 
-    assert report(["a"], replicas, [seen(HELD, instance=4, what=b"")], failures)["a"] == Report(
+    assert report(["a"], replicas, [seen(HELD, instance=4, what=b"")], failures)["a"] == KeptReport(
         "a", 5, 1, "failing, over capacity, loading", "", True
     )
     assert report(["a"], replicas[:2], [], failures)["a"].why == "all failing"
-    assert report(["a"], [], [], failures)["a"] == Report("a", 0, 0)
+    assert report(["a"], [], [], failures)["a"] == KeptReport("a", 0, 0)
 
 
 def test_what_waits_says_for_which() -> None:
-    b = Wanted("b", 0, b"b0", 0, ("c", "a"))
-    assert report(["a", "b", "c"], [A, b], [], {})["b"] == Report("b", 1, 0, "waits for a")
+    b = WantedReplica("b", 0, b"b0", 0, ("c", "a"))
+    assert report(["a", "b", "c"], [A, b], [], {})["b"] == KeptReport("b", 1, 0, "waits for a")
 
 
 @given(st.integers(0, 30), st.floats(0, 20), st.floats(0, 1e6))
@@ -125,8 +135,8 @@ def test_the_waiting_times_grow_and_begin_anew_after_a_long_run(count: int, ran_
 
 
 def test_a_thousand_take_few_steps() -> None:
-    wanted = [Wanted(f"n{i % 100}", i, b"%d" % i, 0, (f"n{(i + 1) % 100}",)) for i in range(1000)]
-    there = [Seen(one.keep, one.instance, one.what, "held", f"q{one.instance}") for one in wanted[::2]]
+    wanted = [WantedReplica(f"n{i % 100}", i, b"%d" % i, 0, (f"n{(i + 1) % 100}",)) for i in range(1000)]
+    there = [SeenReplica(one.keep, one.instance, one.what, "held", f"q{one.instance}") for one in wanted[::2]]
 
     steps, made = steps_of(lambda: compare(wanted, there, {}, 0.0))
 
@@ -145,8 +155,8 @@ class World(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.wanted: list[Wanted] = []
-        self.there: dict[str, Seen] = {}
+        self.wanted: list[WantedReplica] = []
+        self.there: dict[str, SeenReplica] = {}
         self.failures: dict[Slot, Setback] = {}
         self.now = 0.0
         self.count = 0
@@ -155,7 +165,7 @@ class World(RuleBasedStateMachine):
     def apply(self, desired: dict[str, tuple[int, bytes, int | None]]) -> None:
         after = {"b": ("a",), "c": ("a", "b")}
         self.wanted = [
-            Wanted(name, i, what, priority, tuple(one for one in after.get(name, ()) if one in desired))
+            WantedReplica(name, i, what, priority, tuple(one for one in after.get(name, ()) if one in desired))
             for name, (replicas, what, priority) in sorted(desired.items())
             for i in range(replicas)
         ]
@@ -203,12 +213,12 @@ class World(RuleBasedStateMachine):
         elif one.phase == "releasing" and not works:
             self.there[id] = seen(one, phase="held", not_before=self.now + 3)
 
-    def look(self) -> Steps:
+    def look(self) -> ReplicaSteps:
         steps = compare(self.wanted, self.there.values(), self.failures, self.now)
         for one in steps.load:
             self.count += 1
             id = f"{self.count:06}"
-            self.there[id] = Seen(one.keep, one.instance, one.what, "loading", id, State.OK, one.priority)
+            self.there[id] = SeenReplica(one.keep, one.instance, one.what, "loading", id, State.OK, one.priority)
         for one in steps.withdraw:
             self.there[one.id] = seen(one, phase="ending")
         for one in steps.release:

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 import rr_actors as rr
 from rr_actors.actors.messaging.futures import Reply
-from rr_actors.managers.planning.planning_loop import Ended, PlanningLoop
+from rr_actors.managers.planning.planning_loop import PlanningLoop, StepEnded
 from support import eventually
 
 Loop = PlanningLoop[str, str]
@@ -28,7 +28,7 @@ class Watched:
     def __init__(self, look: Look | None = None) -> None:
         self.looks: queue.SimpleQueue[dict[str, str]] = queue.SimpleQueue()
         self.failed: queue.SimpleQueue[BaseException] = queue.SimpleQueue()
-        self.ended: queue.SimpleQueue[Ended] = queue.SimpleQueue()
+        self.ended: queue.SimpleQueue[StepEnded] = queue.SimpleQueue()
         self._given = look
         self.loop = Loop("test", self._look, self.failed.put)
 
@@ -83,7 +83,7 @@ def test_the_loop_looks_at_the_time_that_the_last_look_has_named() -> None:
 @pytest.mark.parametrize(
     ("end", "expected"),
     [
-        (lambda reply: reply.set("on"), Ended("on")),
+        (lambda reply: reply.set("on"), StepEnded("on")),
         (lambda reply: reply.set_exception(rr.LoadFailed("no fuel")), "no fuel"),
     ],
     ids=["value", "error"],
@@ -106,7 +106,7 @@ def test_a_step_is_withdrawn_at_its_limit_and_the_loop_does_not_look_meanwhile(w
     reply: Reply[str] = Reply()
     reply.withdraw = _nothing
     watched.loop.tell(lambda: watched.loop.begin("a", "loads a", lambda: reply, watched.ended.put, limit_s=0.1))
-    assert watched.ended.get(timeout=60) == Ended(is_withdrawn=True)
+    assert watched.ended.get(timeout=60) == StepEnded(is_withdrawn=True)
     assert reply.cancelled()
     assert [watched.looks.get(timeout=60) for _ in range(2)] == [{"a": "loads a"}, {}]
     assert watched.looks.empty()
@@ -116,7 +116,7 @@ def test_a_step_that_ends_within_its_limit_is_not_withdrawn(watched: Watched) ->
     reply: Reply[str] = Reply()
     watched.loop.tell(lambda: watched.loop.begin("a", "loads a", lambda: reply, watched.ended.put, limit_s=60))
     reply.set("on")
-    assert watched.ended.get(timeout=60) == Ended("on")
+    assert watched.ended.get(timeout=60) == StepEnded("on")
 
 
 def test_a_step_that_cannot_begin_ends_with_the_error(watched: Watched) -> None:
@@ -137,7 +137,7 @@ def test_a_step_that_is_withdrawn_ends_once(watched: Watched) -> None:
     watched.begin(reply)
     for _ in range(2):
         watched.loop.tell(lambda: watched.loop.withdraw("a") if "a" in watched.loop.in_flight else None)
-    assert watched.ended.get(timeout=60) == Ended(is_withdrawn=True)
+    assert watched.ended.get(timeout=60) == StepEnded(is_withdrawn=True)
     assert withdrawn.is_set()
     watched.quiet()
     assert watched.ended.empty()
@@ -149,7 +149,7 @@ def test_a_call_that_waits_runs_beside_the_loop(watched: Watched) -> None:
     watched.quiet()
     assert "a" in watched.loop.in_flight
     goes_on.set()
-    assert watched.ended.get(timeout=60) == Ended(True)
+    assert watched.ended.get(timeout=60) == StepEnded(True)
 
 
 def test_an_unexpected_error_makes_the_manager_fail_with_it_and_ends_all_waiting() -> None:

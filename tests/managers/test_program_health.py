@@ -18,7 +18,7 @@ import pytest
 import rr_actors as rr
 from chaos.process_census import stands
 from rr_actors.managers import ProgramHealth, Programs, Ready, RunProgram
-from rr_actors.managers.external_programs import Running
+from rr_actors.managers.external_programs import RunningProgram
 from rr_actors.managers.program_conditions import OutputGoesOn
 from support import Calls, eventually, hang, kill, lives, messages, pid_of, states, wait_respawned
 from support_programs import running_programs
@@ -335,7 +335,7 @@ def test_the_silence_of_a_standstill_of_the_manager_does_not_count(start: Start,
 def test_output_goes_on_whatever_becomes_of_the_clock(tmp_path: Path) -> None:
     output = tmp_path / "output.log"
     goes_on = OutputGoesOn(output, within_s=100.0, look_s=100.0)
-    running = Running(1, 0.0)
+    running = RunningProgram(1, 0.0)
     assert goes_on(running) == ""
     for set_to in (0.0, time.time() + 10**6):
         output.write_text("x" * 10)
@@ -347,13 +347,13 @@ def test_output_stops_when_nothing_was_written_for_the_time(tmp_path: Path) -> N
     output = tmp_path / "output.log"
     output.write_text("x")
     goes_on = OutputGoesOn(output, within_s=0.5, look_s=100.0)
-    seen = eventually(lambda: goes_on(Running(1, 0.0)))
+    seen = eventually(lambda: goes_on(RunningProgram(1, 0.0)))
     assert seen.startswith("no line of its output for 0.")
     goes_on.begin()
     output.unlink()  # it gets long: its name goes to a new file
-    eventually(lambda: goes_on(Running(1, 0.0)))
+    eventually(lambda: goes_on(RunningProgram(1, 0.0)))
     output.write_text("y")
-    assert goes_on(Running(1, 0.0)) == ""
+    assert goes_on(RunningProgram(1, 0.0)) == ""
 
 
 # -- bad input -------------------------------------------------------------------------------------------------------

@@ -105,7 +105,7 @@ def test_the_site_is_built_without_warnings_and_network_and_fetches_nothing(tmp_
     assert "data-theme=dark" in (out / "_static" / "styles" / "furo.css").read_text()
 
 
-OPTIONS = [rr.RegistrarConfig, rr.SystemConfig, rr.ChildSpec, rr.Supervisor, rr.Backoff]
+OPTIONS = [rr.RegistrarConfig, rr.SystemConfig, rr.ChildSpec, rr.Supervisor, rr.Backoff, rr.Hosts, rr.Export]
 ENTRY = re.compile(r"^    (\w+(?:, \w+)*): (.*?)(?=^    \w|^$|\Z)", re.MULTILINE | re.DOTALL)
 ADVICE = re.compile(r"(?:[.;] )(?:Give|Set|Raise|Lower|Turn|Name|raise) ")
 

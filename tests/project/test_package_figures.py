@@ -28,6 +28,21 @@ REMEMBERING = {
 }  # fmt: skip
 """The files that a status passes on its way into the system's memory (docs/decisions/0076), not to its holders."""
 
+BESIDE = {
+    f"rr_actors/{name}.py"
+    for name in (
+        # a journal is folded 0.1 s after a commit, by a worker
+        "storage/sqlite_store", "storage/sql_tables", "storage/catalog_lock", "storage/damage", "storage/witness",
+        # a dial that nobody answers yet is tried again
+        "base/scarcity",
+        # the acknowledgement of the status, and the types of the servers, come before or after the holder hears
+        "registrar/core/notices", "registrar/engine/registrar_actor",
+        # looks at the disk, each some seconds
+        "hosting/run_files", "system/console/console_server",
+    )
+}  # fmt: skip
+"""The files of other work that comes into a restore at times, or nearly always: that takes most of a second."""
+
 
 def test_no_room_imports_a_room_above_it() -> None:
     assert imports_up() == []
@@ -51,7 +66,7 @@ def test_a_load_a_status_and_a_restore_pass_no_more_files_than_they_did() -> Non
     assert len(registrar_entries("load")) <= 3
     assert len(passed("load")) <= 25
     assert len(passed("status") - REMEMBERING) <= 25
-    assert len(passed("restore")) <= 58
+    assert len(passed("restore") - BESIDE) <= 55
 
 
 def test_no_more_lines_of_tests_use_a_private_attribute() -> None:

@@ -104,6 +104,19 @@ def test_comments_and_docstrings_of_the_package_use_standard_words() -> None:
     assert [str(module.relative_to(REPOSITORY)) for module in MODULES if PRIVATE.search(module.read_text())] == []
 
 
+EXERCISES = sorted((REPOSITORY / "rr_actors" / "tools" / "learn" / "exercises").rglob("*.py.txt"))
+
+
+@pytest.mark.parametrize("program", EXERCISES, ids=lambda program: f"{program.parent.name}-{program.name}")
+def test_an_exercise_has_short_sentences_of_standard_words(program: Path) -> None:
+    text = program.read_text()
+    tree = ast.parse(text)
+    hints = re.findall(r'^#     "(.*)",$', text, re.MULTILINE)
+    said = [ast.get_docstring(tree) or "", *texts(tree), *hints]
+    assert PRIVATE.findall(text) == []
+    assert [part for one in said for part in DOCUMENTED.split(one) if words(part) > LIMIT] == []
+
+
 NO_VERB = re.compile(
     r"(a|all|an|and|as|at|each|every|for|from|how|if|in|it|its|no|none|nobody|now|of|on|one|only|some|such|that|the"
     r"|their|them|there|these|they|this|those|to|two|under|what|when|where|whether|which|who|whose|with|without)\b",

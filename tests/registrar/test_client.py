@@ -10,7 +10,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.registrar.engine.effect_runner import EffectRunner
-from rr_actors.registrar.links.provider_link import ListQueries
+from rr_actors.registrar.links.provider_link import FetchQueries
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import effects as e
 from rr_actors.registrar.model.messages import Fetched, Unload
@@ -66,12 +66,12 @@ def test_a_fetch_behind_another_returns_also_what_was_loaded_since_that_was_answ
         heard.append(sorted(query.query_id for query in queries))
 
     held_back.on = True
-    call(client.deliver, ListQueries(hear))
+    call(client.deliver, FetchQueries(hear))
     eventually(lambda: held_back.messages)
     second = app.load("provider/thing", "second")
     held_back.on = False
     for _ in range(2):
-        call(client.deliver, ListQueries(hear))
+        call(client.deliver, FetchQueries(hear))
     call(held_back.messages[0])
 
     eventually(lambda: len(heard) == 3)
@@ -100,7 +100,7 @@ def test_a_fetch_ends_when_its_registrar_is_closed(
     heard: list[Any] = []
 
     async def fetch() -> None:
-        client.deliver(ListQueries(lambda *answer: heard.append(answer)))  # one that the loop takes after the close
+        client.deliver(FetchQueries(lambda *answer: heard.append(answer)))  # one that the loop takes after the close
 
     actor_of(app).node.dispatcher.run(fetch(), timeout_s=LIMIT_S)
     assert [type(error) for _, error in heard] == [rr.RegistrarDown]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -33,6 +35,13 @@ class Scopes(rr.Manager):
     @open_scope.unload
     def close_scope(self, name: str, response: str) -> None:
         self.log.append(f"closes {name}")
+
+    @rr.server("slow", recovery="keep", exclusive=True)
+    def open_slow(self, name: str) -> str:
+        if "opens slow" in self.log:
+            rr.current().stopping.wait()
+        self.log.append("opens slow")
+        return f"/dev/{name}"
 
     @rr.server("warm", recovery="keep", exclusive=True, linger_s=60.0)
     def open_warm(self, name: str) -> str:
@@ -121,6 +130,38 @@ def test_a_load_that_may_not_wait_says_who_has_it_since_when(system: rr.System, 
         assert [frame.origin for frame in busy.trace] == ["scopes/scope"]
         assert _count(system) == 2  # it has left nothing
     waits.get(timeout=LIMIT_S).unload()
+
+
+@pytest.mark.parametrize("way", ["a thread", "a second load of a thread", "a future", "a task"])
+def test_a_load_whose_time_is_over_in_line_says_who_has_it_since_when(people: Any, way: str) -> None:
+    anna, ben, *_ = people
+    before = time.time()
+    with anna.load(Scopes.open_scope, "bench"):
+        if way == "a second load of a thread":
+            ben.load(Scopes.open_scope, "roof").unload()
+            ben.load(Scopes.open_scope, "roof").unload()
+        says = r"^scopes/scope: not loaded .* the load is 1st in line; anna has it \(asked for it .* s ago\); "
+        ways = {
+            "a future": lambda: ben.load(Scopes.open_scope, "bench", timeout_s=1.0, block=False).get(),
+            "a task": lambda: asyncio.run(ben.load_async(Scopes.open_scope, "bench", timeout_s=1.0)),
+        }
+        with pytest.raises(rr.LoadTimeout, match=says) as info:
+            ways.get(way, lambda: ben.load(Scopes.open_scope, "bench", timeout_s=1.0))()
+        assert info.value.holder == "anna"
+        assert info.value.since is not None
+        assert before - 1 <= info.value.since <= time.time()
+
+
+def test_a_load_whose_time_is_over_in_its_turn_names_no_holder(people: Any) -> None:
+    anna, ben, *_ = people
+    first, said = anna.load(Scopes.open_slow, "bench"), Said()
+    waits = ben.load(Scopes.open_slow, "bench", block=False, timeout_s=2.0, progress=said)
+    assert eventually(lambda: said)
+    first.unload()
+    with pytest.raises(rr.LoadTimeout, match="its load callback") as info:
+        waits.get()
+    assert (info.value.holder, info.value.since) == ("", None)
+    assert said == ["1st in line; anna has it"]
 
 
 def test_a_load_that_is_given_up_leaves_the_line(system: rr.System, people: Any) -> None:

@@ -56,6 +56,16 @@ def test_a_query_of_a_revoked_resource_is_released(app: rr.Registrar, provider: 
     with app.load("provider/thing", "x") as query:
         provider.revoke(query.resource_id, "enough", timeout_s=30)
         assert eventually(lambda: not app.queries())
+        assert eventually(lambda: query.released)
+
+
+def test_a_query_that_its_holder_releases_is_not_released_by_its_provider(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    serve(provider, "thing")
+    query = app.load("provider/thing", "x")
+    query.unload()
+    assert not query.released
 
 
 @pytest.mark.parametrize("how", ["handled", "replaced"])

@@ -45,7 +45,7 @@ def test_other_names_of_servers_are_refused(provider: rr.Registrar, name: Any) -
 
 
 @pytest.mark.parametrize(
-    "server", ["camera", "", "/", "a/", "/a", "a/b/c", "a//b", "a b/c", "a\0b", "x" * 500, None, 7]
+    "server", ["camera", "", "/", "a/", "/a", "a/b/c/d", "a//b", "a b/c", "a\0b", "x" * 500, None, 7]
 )
 def test_a_server_is_addressed_as_registrar_slash_server(app: rr.Registrar, server: Any) -> None:
     with pytest.raises(rr.InvalidName):

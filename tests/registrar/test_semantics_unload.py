@@ -269,7 +269,7 @@ def test_an_unload_says_at_once_and_at_its_end_that_the_provider_is_stopped(
     assert thread.is_alive()
     thread.join()
     if way == "close":
-        assert "app: closed with 1 queries" in caplog.text
+        assert "app: closed with 1 query" in caplog.text
         return
     (error,) = failed
     assert "'shop' did not answer within 1 s; the release is owed" in str(error)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from rr_actors.managers.budgets.planner import Asked, Plan, Running, plan
+from rr_actors.managers.budgets.planner import AskedShare, BudgetPlan, HeldShare, plan
 from simulation.budgets import Budget
 from simulation.explore import Walk, digest, picture, walk
 from simulation.oracle import Violation
@@ -74,35 +74,37 @@ def test_a_broken_protocol_is_found_with_a_shortest_history(name: str, monkeypat
     assert len(done.history) == steps
 
 
-def over(*given: Any) -> Plan:
+def over(*given: Any) -> BudgetPlan:
     """Admits who has to wait."""
     made = plan(*given)
-    return Plan(admit=[*made.admit, *made.wait])
+    return BudgetPlan(admit=[*made.admit, *made.wait])
 
 
-def too_many(capacity: float, policy: Any, running: list[Running], asked: list[Asked]) -> Plan:
+def too_many(capacity: float, policy: Any, running: list[HeldShare], asked: list[AskedShare]) -> BudgetPlan:
     """Revokes somebody for each who asks, also for who fits."""
     made = plan(capacity, policy, running, asked)
     made.revoke = [share.id for share in running if not share.leaving][: len(asked)]
     return made
 
 
-def of_equals(capacity: float, policy: Any, running: list[Running], asked: list[Asked]) -> Plan:
+def of_equals(capacity: float, policy: Any, running: list[HeldShare], asked: list[AskedShare]) -> BudgetPlan:
     """Revokes what is as urgent as who asks."""
     return plan(capacity, policy, running, [replace(one, priority=(one.priority or 0) + 1) for one in asked])
 
 
-def never(*given: Any) -> Plan:
+def never(*given: Any) -> BudgetPlan:
     """Has all wait."""
     made = plan(*given)
-    return Plan(wait=[*made.admit, *made.wait])
+    return BudgetPlan(wait=[*made.admit, *made.wait])
 
 
 @pytest.mark.parametrize(
     ("planner", "capacity", "name"),
     [(over, 2.0, "sum"), (too_many, 4.0, "victims"), (of_equals, 2.0, "victims"), (never, 2.0, "waiting")],
 )
-def test_a_planner_of_budgets_with_a_defect_is_found(planner: Callable[..., Plan], capacity: float, name: str) -> None:
+def test_a_planner_of_budgets_with_a_defect_is_found(
+    planner: Callable[..., BudgetPlan], capacity: float, name: str
+) -> None:
     done = walk(WORLDS["budget"]._replace(budget=Budget(capacity, planner)))
 
     assert isinstance(done.violation, Violation)

@@ -27,6 +27,8 @@ from rr_actors.runtime.processes.process import Exited, Process, Spawner
 from support import WARM, eventually, lives, quickly, wait_gone
 from support_children import hear
 
+pytestmark = pytest.mark.cold
+
 TELL = "support_children:until_told"
 
 

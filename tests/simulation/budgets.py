@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
-from rr_actors.managers.budgets.planner import Asked, Plan, Running, plan
+from rr_actors.managers.budgets.planner import AskedShare, BudgetPlan, HeldShare, plan
 from rr_actors.managers.budgets.pools import POLICY
 from rr_actors.registrar.model.rows import STANDBY, Phase, Resource
 from simulation.oracle import Violation
@@ -30,7 +30,7 @@ class Budget(NamedTuple):
     """A pool of this capacity, and the planner: the real one, or one with a defect."""
 
     capacity: float
-    planner: Callable[..., Plan] = plan
+    planner: Callable[..., BudgetPlan] = plan
 
     def decides(self, key: Key) -> bool:
         """Return whether this step is the end of a load of a share."""
@@ -59,7 +59,7 @@ class Budget(NamedTuple):
             book = _there(world, book)
             self._check_victims(world, book, self._planned(world, book))
 
-    def _check_victims(self, world: World, book: Book, made: Plan) -> None:
+    def _check_victims(self, world: World, book: Book, made: BudgetPlan) -> None:
         """Check that each victim is needed for somebody of higher priority, and that who fits does not wait."""
         shares, ranks = _shares(world), world.registrars[NAME].catalog.priority_of
         gone = book.leaving | {*made.revoke}
@@ -75,14 +75,14 @@ class Budget(NamedTuple):
         if not gone and any(_amount(shares[id]) <= free for id in waits):
             raise Violation("waiting", f"{waits} wait, and {free:g} is free")
 
-    def _planned(self, world: World, book: Book) -> Plan:
+    def _planned(self, world: World, book: Book) -> BudgetPlan:
         shares = _shares(world)
         running = [
-            Running(id, _amount(shares[id]), _priority(world, id), at, id in book.leaving)
+            HeldShare(id, _amount(shares[id]), _priority(world, id), at, id in book.leaving)
             for at, id in enumerate(book.admitted)
         ]
         asked = [
-            Asked(id, _amount(shares[id]), _priority(world, id), at)
+            AskedShare(id, _amount(shares[id]), _priority(world, id), at)
             for at, id in enumerate(_asking(world))
             if id in shares
         ]

@@ -58,7 +58,10 @@ class Network(WorldState):
             return False
         here, there = self.registrars[consumer], self.registrars[provider]
         known = there.state in ("away", "absent") and provider in here.gone and provider not in here.asked
-        if not known and (gone := self.unreachable(provider, provider in here.asked)) is not None:
+        stays_down = there.state == "absent" or (there.state == "stopped" and provider in here.stopped)
+        asked = provider in here.asked or (stays_down and here.catalog.waits_for(provider))
+        (here.stopped.add if there.state == "stopped" else here.stopped.discard)(provider)
+        if not known and (gone := self.unreachable(provider, asked)) is not None:
             here.asked.discard(provider)
             here.post(gone)
             if gone.final:

@@ -110,7 +110,7 @@ def _can(world: World, key: Key) -> bool:
         here, there = world.registrars[key[1]], world.registrars[key[2]]
         if there.state in ("away", "absent"):
             final = key[2] not in here.gone and world.unreachable(key[2], asked=False) is not None
-            return final or key[2] in here.asked
+            return final or key[2] in here.asked or here.catalog.waits_for(key[2])
         return there.state in ("up", "gone") or (there.state == "starting" and key[1] == key[2])
     if key[0] == "reregister":
         return key[2] not in world.registrars[key[1]].catalog.servers

@@ -136,6 +136,7 @@ class SimShell:
         self.fetches = self.epoch << 32
         self.epochs: dict[int, int] = {}  # of the provider, by the number of the Fetch that opened a link to it
         self.asked: set[str] = set()
+        self.stopped: set[str] = set()  # providers that were stopped when it last tried to reach them
         self.gone: set[str] = set()  # providers of which it knows that they are gone for good
         self.closing: Any = None  # lives.Closing, while it is being closed
         self.routes = Routes()

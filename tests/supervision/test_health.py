@@ -36,6 +36,8 @@ from support import (
 )
 from support_children import hear
 
+pytestmark = pytest.mark.cold
+
 Start = Callable[..., rr.System]
 
 

@@ -263,7 +263,7 @@ def test_terminate_child_unloads_what_it_serves_and_leaves_nothing(
         ports.terminate_child("ttyS0")
 
 
-def test_an_orderly_stop_of_the_system_leaves_nothing(start: Start, state_dir: Path, args: list[str]) -> None:
+def test_a_clean_stop_of_the_system_leaves_nothing(start: Start, state_dir: Path, args: list[str]) -> None:
     system = start(tree())
     system.supervisor("pool").start_child(args, id="ttyS0")
     system.open_registrar("app").load("ttyS0/thing", THING)

@@ -414,6 +414,7 @@ def test_a_backoff_shows_as_restarting_and_does_not_hold_up_a_stop(plant: Plant,
     assert tree.stop() < 8
 
 
+@pytest.mark.cold
 def test_a_child_is_restarted_after_its_fork_server_was_killed(plant: Plant, log: Log) -> None:
     tree = plant(worker(log, "a"))
     pid = tree.pid("root/a")
@@ -769,10 +770,24 @@ def test_each_exit_is_one_structured_log_line(plant: Plant, log: Log, caplog: py
     tree.pid("root/a", not_=pid)
     (line,) = [record for record in caplog.records if record.name == "rr_actors.supervision"]
     assert line.message.startswith("exited path=root/a run=1 ")
-    assert "reason=killed" in line.message
+    assert "reason=killed signal=SIGKILL restarts=1" in line.message  # once, not with its code and in words, too
     facts: dict[str, Any] = line.__dict__["supervision"]
     assert (facts["event"], facts["code"], facts["signal"]) == ("exited", -9, "SIGKILL")
     assert line.levelno == logging.WARNING
+
+
+def test_the_run_of_an_event_counts_the_starts_of_its_child_alone(plant: Plant, log: Log) -> None:
+    tree = plant(worker(log, "a"), worker(log, "b"))
+    for _ in range(2):
+        pid = tree.kill("root/b")
+        tree.pid("root/b", not_=pid)
+    eventually(lambda: [(e["event"], e.get("run")) for e in tree.events if e["path"] == "root/a"] == [("started", 1)])
+    eventually(
+        lambda: (
+            [(e["event"], e.get("run")) for e in tree.events if e["path"] == "root/b"]
+            == [("started", 1), ("exited", 1), ("restarted", 2), ("exited", 2), ("restarted", 3)]
+        )
+    )
 
 
 def test_a_child_stopped_while_it_waits_to_be_started_again_has_not_died_once_more() -> None:
@@ -804,6 +819,7 @@ def test_events_are_told_as_they_happen_from_every_process(plant: Plant, log: Lo
     assert tree.events[2]["signal"] == "SIGKILL"
 
 
+@pytest.mark.cold  # it counts the processes below the fork server
 def test_random_kills_and_calls_leave_a_tree_that_is_whole(plant: Plant, log: Log) -> None:
     chance = random.Random(4)
     inner = Supervisor(

@@ -21,6 +21,8 @@ from rr_actors.supervision.event_history import Record
 from support import catalog_path, eventually, kill, lives, pid_of, wait_respawned
 from support_wants import KINDS, PLACE, ROLES, Wants
 
+pytestmark = pytest.mark.cold
+
 Start = Callable[..., rr.System]
 CONFIG = rr.SystemConfig(preload=("support_wants",))
 MANY = 120

@@ -815,12 +815,12 @@ def test_the_state_of_one_query_is_asked_for_and_no_other_row(
         return ask(self, request, *rest)
 
     monkeypatch.setattr(ConsoleClient, "ask", noted)
-    assert first.fetch_state() == "OK"
+    assert first.fetch_state() is rr.State.OK
     assert list(asked) == [Find(first.id, "client.worker")]
     first.unload()
     with pytest.raises(UnknownQuery, match="does not hold it any more"):
         worker.fetch_state(first.id)
-    assert worker.fetch_state(second) == "OK"
+    assert worker.fetch_state(second) is rr.State.OK
 
 
 def test_queries_that_are_not_known_are_no_empty_list(client: rr.Client, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.base.errors import ConfigError, NotFound, NotRunning, RrError, Unavailable, UnknownQuery, UsageError
 from rr_actors.registrar.engine.node import Node
-from rr_actors.registrar.pages import Page, ResourceRow, Wanted
+from rr_actors.registrar.pages import ResourceRow, RowPage, Wanted
 from rr_actors.system.console import console_feed, console_view
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_commands import (
@@ -410,7 +410,7 @@ def test_resources_have_room_in_an_answer_beside_the_notes_on_registrars_that_do
         provider.send_status(query, rr.Status("WARNING", long))
     page = console_view.page
 
-    def answered(registrar: rr.Registrar, wanted: Wanted) -> Page:
+    def answered(registrar: rr.Registrar, wanted: Wanted) -> RowPage:
         if registrar.name == "app":
             raise Unavailable(longer)
         return page(registrar, wanted)

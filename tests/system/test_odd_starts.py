@@ -15,6 +15,8 @@ import pytest
 import rr_actors as rr
 from support import REPOSITORY
 
+pytestmark = pytest.mark.cold
+
 LIMIT_S = 40.0
 MANAGER = """
 import rr_actors as rr

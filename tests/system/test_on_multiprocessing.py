@@ -22,6 +22,8 @@ import rr_actors as rr
 from support import REPOSITORY, eventually, kill, lives, pid_of, wait_gone, wait_respawned
 from support_on_multiprocessing import Known
 
+pytestmark = pytest.mark.cold
+
 Start = Callable[..., rr.System]
 NAMES = ["root/one", "root/two"]
 

@@ -106,6 +106,12 @@ def _instances(system: rr.System) -> list[Any]:
     found += [*supervisor.which_children(), supervisor.count_children(), rr.Supervisor([]), rr.Backoff(), app.config]
     found += [system.config, system.tree(), system.dead_letters(), rr.ExitReport("normal")]
     found += [rr.NotFound("x", id="x", known=()), rr.LoadFailed("x", server="x"), rr.Recording("x"), rr.Trace("x", [])]
+    simulated = rr.simulate(rr.Supervisor([spec]), until_s=1)
+    found += [
+        simulated,
+        *simulated.children.values(),
+        rr.experiment(rr.Supervisor([spec]), (), vary={"max_restarts": [1]}, runs=1),
+    ]
     with rr.connect(system.state_dir) as client:
         worker = client.open_registrar(name)
         found += [client, worker, worker.load(f"{name}/thing", 1)]

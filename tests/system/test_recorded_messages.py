@@ -212,10 +212,10 @@ def test_messages_of_all_of_some_and_of_nobody(system: rr.System, tmp_path: Path
         system.ref("pong").ask(1)
         app.load("cameras/camera", "left")
         wait_for(recording, expected=["pong>root Answer 2", "cameras>app Loaded ", "pong>cameras Answer 5"])
-    assert {"root>pong Ask 1", "app>cameras Load 'left'"} <= set(said(recording.messages()))
+    assert {"root>pong Ask 1", 'app>cameras Load "left"'} <= set(said(recording.messages()))
     of_pong = said(recording.messages("root/pong"))
     assert "root>pong Ask 1" in of_pong
-    assert "app>cameras Load 'left'" not in of_pong
+    assert 'app>cameras Load "left"' not in of_pong
     with pytest.raises(rr.NotFound, match=r"'nobody': .* no message of an actor or registrar of this name; there are"):
         recording.messages("nobody")
     recording.save(tmp_path / "file")

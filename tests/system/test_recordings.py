@@ -295,7 +295,7 @@ def test_a_diagram_of_many_messages_without_an_answer_takes_no_longer_for_each()
             Entry(n / 1e4, "sent", seq=n, registrar="a", peer="b", name="Noticed", query=str(n)) for n in range(20_000)
         ]
         began = time.monotonic()
-        assert "19000 entries more" in sequence_of(many)
+        assert "19,000 more entries" in sequence_of(many)
         return time.monotonic() - began
 
     quickly(drawn, 1.0)

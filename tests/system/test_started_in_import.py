@@ -14,6 +14,8 @@ from rr_actors.supervision.core.specs import ChildSpec
 from rr_actors.supervision.import_guard import check_children_can_import
 from support import REPOSITORY
 
+pytestmark = pytest.mark.cold
+
 LIMIT_S = 30.0
 
 

@@ -259,7 +259,7 @@ def test_a_picture_of_many_children_and_lives_is_bounded_and_counts_what_it_leav
     ]
     timeline = timeline_of(entries)
 
-    assert "51 lanes with less trouble are left out" in texts(timeline.svg())
+    assert "left out: 51 lanes with less trouble" in texts(timeline.svg())
     assert len(timeline.svg()) < 8_000_000
     plain = timeline.plain()
     assert sum(len(lane["bars"]) + len(lane["marks"]) for lane in plain["lanes"]) <= MOST_SENT

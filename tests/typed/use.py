@@ -42,6 +42,30 @@ class Cameras(rr.Manager):
     def recover_camera(self, request: OpenCamera, response: Feed) -> Feed:
         return self.open_camera(request)
 
+    @open_camera.usage
+    async def camera_usage(self, request: OpenCamera, response: Feed) -> dict[str, int]:
+        return {"frames": 1}
+
+    @open_camera.upgrade
+    def upgrade_camera(self, request: Any, response: Any) -> tuple[OpenCamera, Feed]:
+        return OpenCamera(request["device"]), Feed(response["topic"])
+
+    @rr.server("lamp", idle="pause", health=rr.Health(every_s=5.0))
+    def open_lamp(self, name: str) -> Feed | None:
+        return None
+
+    @open_lamp.health
+    def look(self, name: str, response: Feed | None) -> rr.State | None:
+        return None
+
+    @open_lamp.pause
+    async def pause_lamp(self, name: str, response: object) -> int:
+        return 3
+
+    @open_lamp.resume
+    async def resume_lamp(self, name: str, response: Feed | None) -> Feed:
+        return Feed(name)
+
     @rr.server("rate")
     async def measure_rate(self, device: str) -> float:
         camera = await self.registrar.load_async(Cameras.open_camera, OpenCamera(device))
@@ -61,6 +85,10 @@ class Cameras(rr.Manager):
 
     @zoom.unload
     def end_zoom(self, device: str, response: Feed) -> None: ...
+
+    @zoom.recover
+    def recover_zoom(self, factor: float, device: str, response: Feed) -> Feed:
+        return response
 
     @rr.server("all")
     def open_all(self) -> list[str]:
@@ -138,7 +166,7 @@ def use(app: rr.Registrar, block: bool) -> None:
     declared_later = app.load(Cameras.open_camera, OpenCamera("b"), block=False)
     assert_type(declared_later.get(), rr.Query[Feed])
     assert typed_later.get().response == declared_later.get().response == later.get().response == Feed("/imagesb")
-    either = app.load("cameras/anything", 3, block=block)
+    either = app.load("cameras/anything", 3) if block else app.load("cameras/anything", 3, block=False)
     assert_type(either, rr.Query[Any] | pykka.Future[rr.Query[Any]])
 
     with app.load("cameras/anything", "a", response_type=str) as query:
@@ -155,6 +183,7 @@ def use(app: rr.Registrar, block: bool) -> None:
 
 async def use_async(app: rr.Registrar) -> None:
     assert_type(await app.load_async("cameras/camera", OpenCamera("b")), rr.Query[Any])
+    assert_type(await app.load_async("cameras/all"), rr.Query[Any])
     assert_type(await app.load_async("cameras/camera", OpenCamera("b"), response_type=Feed), rr.Query[Feed])
     assert_type(await app.load_async(Cameras.open_camera, OpenCamera("b")), rr.Query[Feed])
     fractions: list[float] = []

@@ -36,17 +36,27 @@ Kinds = Mapping[str, type[Action]]
 _Stamp = tuple[int, int, int]
 
 
+_TRIES = 2  # a process may also be killed by somebody else while a file runs; a load is given up after three deaths
+
+
+class _Begun(msgspec.Struct):
+    """A text of a file that runs now, or with which processes have ended: how often, in which run of the system."""
+
+    run: str
+    file: str
+    text: str
+    tries: int
+
+
 class _Record(msgspec.Struct):
     """The run of the system that has read the files, and the texts of those that hold, by their paths.
 
-    `begun`: the paths and texts that run now, and in which run of the system. A crash leaves the one that has
-    ended the process.
+    `unended`: what has begun to run and has not ended. A crash leaves the text that may have ended the process.
     """
 
     run: str = ""
     texts: dict[str, str] = {}
-    begun_in: str = ""
-    begun: list[tuple[str, str]] = []
+    unended: list[_Begun] = []
 
 
 class ActionFolder:
@@ -71,20 +81,18 @@ class ActionFolder:
         self._texts: dict[str, str] = {}
         self._by_file: dict[str, Kinds] = {}
         self.faults: dict[str, ConfigError] = {}
-        self._record: KeptRecord[_Record] | None = None
         self._run = "" if beginning is None else beginning.run
-        record = None if beginning is None else KeptRecord(beginning.directory / "actions.json", _Record)
-        self._kept = record
-        self._begun: list[tuple[str, str]] = []
-        if beginning and record and not beginning.by_hand and record.now.begun_in == beginning.run:
-            self._begun = list(record.now.begun)
-        if beginning is None or record is None or beginning.by_hand or record.now.run != beginning.run:
-            self.look()
+        self._record = None if beginning is None else KeptRecord(beginning.directory / "actions.json", _Record)
+        self._unended: list[_Begun] = []
+        record = None if beginning is None or beginning.by_hand or self._record is None else self._record.now
+        if record is not None:
+            self._unended = [begun for begun in record.unended if begun.run == self._run]
+        if record is not None and record.run == self._run:
+            self._go_on(record.texts)
+        else:
+            self._read_changed()
             for fault in self.faults.values():
                 raise fault  # what held before a crash stays in the record
-        else:
-            self._go_on(record.now.texts)
-        self._record = record
         self._take()
 
     def look(self) -> bool:
@@ -92,6 +100,13 @@ class ActionFolder:
 
         A file that is wrong leaves what it said before; a file that is gone leaves nothing.
         """
+        before = self._stamps
+        is_news = self._read_changed()
+        if self._stamps is not None and self._stamps is not before:
+            self._take()
+        return is_news
+
+    def _read_changed(self) -> bool:
         try:
             stamps = self._stamps_now()
         except ConfigError as error:
@@ -109,7 +124,6 @@ class ActionFolder:
         for file in sorted(self.faults):  # a class may have moved from one file to another
             self._read(file)
         self._stamps = stamps
-        self._take()
         return True
 
     def _stamps_now(self) -> dict[str, _Stamp]:
@@ -149,22 +163,24 @@ class ActionFolder:
         """Run a text, and return its classes of actions.
 
         Raises:
-            ConfigError: it is wrong, or the process ended when it ran before.
+            ConfigError: it is wrong, or the process ended each time when it ran before.
         """
-        if (file, text) in self._begun:
+        others = [begun for begun in self._unended if (begun.file, begun.text) != (file, text)]
+        tries = max((begun.tries for begun in self._unended if begun not in others), default=0)
+        if tries >= _TRIES:
             said = "one with which the manager's process ended; it runs again when it has changed"
             raise wrong(file, "", _PYTHON, None, said=said)
-        self._note_begun([*self._begun, (file, text)])
+        self._note_unended([*others, _Begun(self._run, file, text, tries + 1)])
         try:
             return self._run_text(file, text)
         finally:
-            self._note_begun([begun for begun in self._begun if begun != (file, text)])
+            self._note_unended(others)
 
-    def _note_begun(self, begun: list[tuple[str, str]]) -> None:
-        self._begun = begun
-        if self._kept is not None:
-            self._kept.now.begun_in, self._kept.now.begun = self._run, begun
-            self._kept.save()
+    def _note_unended(self, unended: list[_Begun]) -> None:
+        self._unended = unended
+        if self._record is not None:
+            self._record.now.unended = unended
+            self._record.save()
 
     def _run_text(self, file: str, text: str) -> Kinds:
         others = {**self._taken, **_merged(kinds for name, kinds in self._by_file.items() if name != file)}
@@ -214,7 +230,7 @@ class ActionFolder:
         """Let the classes of all files hold, and write their texts."""
         self.kinds: Kinds = _merged(self._by_file.values())
         if self._record is not None:
-            now = _Record(self._run, dict(self._texts), self._run, self._begun)
+            now = _Record(self._run, dict(self._texts), self._unended)
             if now != self._record.now:
                 self._record.now = now
                 self._record.save()

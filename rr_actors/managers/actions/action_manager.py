@@ -13,8 +13,10 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import PurePath
 from typing import Any, Literal
 
+from rr_actors.actors.actor_tables import TableColumn, table
 from rr_actors.base import pickling
 from rr_actors.base.checks import is_number
 from rr_actors.base.errors import (
@@ -29,10 +31,11 @@ from rr_actors.base.errors import (
     UsageError,
     shown,
 )
-from rr_actors.base.names import is_planned, new_id
+from rr_actors.base.names import is_planned, new_id, short_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.managers.actions.action import Action, RunControl, Word, bind, given_to, name_of, result_of, run_alone
-from rr_actors.managers.actions.graph_documents import read_graph
+from rr_actors.managers.actions.graph_checks import checked_inputs
+from rr_actors.managers.actions.graph_documents import document_in, feedback, read_graph, run_in
 from rr_actors.managers.actions.graph_engine import GraphEngine
 from rr_actors.managers.actions.graph_library import GraphLibrary, Shelf
 from rr_actors.managers.actions.graph_log import GraphLog, logged
@@ -43,19 +46,15 @@ from rr_actors.managers.actions.graph_runs import (
     OVER,
     Begin,
     Change,
-    Ended,
     Event,
     GraphRun,
     Halt,
+    NodeEnded,
     NodeRun,
     Pause,
     Restored,
     Resume,
-    checked_inputs,
-    document_in,
-    feedback,
     first_run,
-    run_in,
 )
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.manager import Manager
@@ -68,6 +67,7 @@ from rr_actors.runtime.processes.isolated import Events, run_isolated
 logger = Log("rr_actors.managers.actions")
 
 INTERRUPTED = "interrupted"
+_OVER = ("FINISHED", "BYPASSED", "STOPPED", "ERROR")  # an action that has ended
 
 
 @dataclass(frozen=True)
@@ -88,6 +88,9 @@ class RunAction:
     attempt: int = 1
     engine: str = ""
 
+    def __rr_title__(self) -> str:
+        return f"{self.action}, attempt {self.attempt}"
+
 
 @dataclass(frozen=True)
 class ControlRun:
@@ -103,6 +106,9 @@ class ControlRun:
     word: Literal["run", "pause", "stop", "over", "ask"]
     step: int = 0
     id: str = field(default_factory=new_id)
+
+    def __rr_title__(self) -> str:
+        return f"{self.word} run {short_id(self.run)}"
 
 
 @dataclass(frozen=True)
@@ -139,6 +145,11 @@ class RunGraph:
     inputs: dict[str, Any] = field(default_factory=dict[str, Any])
     instance: str = field(default_factory=new_id)
     file: str = ""
+
+    def __rr_title__(self) -> str:
+        if isinstance(self.graph, str):
+            return self.graph
+        return str(self.graph.get("graph_name") or PurePath(self.file).name.partition(".")[0] or "graph")
 
 
 class Actions(Manager):
@@ -215,6 +226,37 @@ class Actions(Manager):
             acting = list(self._acting)
         for action in acting:
             action.stopping.set()
+
+    @table(
+        "graphs",
+        TableColumn("graph"),
+        TableColumn("id", kind="id"),
+        TableColumn("state"),
+        TableColumn("ended", kind="bar", of="actions"),
+        TableColumn("running", kind="long"),
+        TableColumn("why", kind="problem"),
+    )
+    def graph_rows(self) -> list[dict[str, Any]]:
+        """Return the graphs that are loaded: the state of each, what runs, and how many of its actions have ended."""
+        with self._lock:
+            engines = dict(self._engines)
+        rows: list[dict[str, Any]] = []
+        for id, engine in engines.items():
+            graph, run = engine.graph, engine.run
+            states = {name: node.state for name, node in run.nodes.items()}
+            rows.append(
+                {
+                    "graph": graph.name,
+                    "id": id,
+                    "state": run.state,
+                    "ended": sum(state in _OVER for state in states.values()),
+                    "actions": len(states),
+                    "running": [name for name, state in states.items() if state in LIVE],
+                    "states": states,
+                    "why": run.why,
+                }
+            )
+        return rows
 
     # -- messages --------------------------------------------------------------------------------------------------
 
@@ -497,16 +539,16 @@ class Actions(Manager):
         actor = action.actor or self.registrar.name
         return self.registrar.load(f"{actor}/action", request, parent=graph_id, timeout_s=None)
 
-    def end_of(self, query: Query, node: str, run: NodeRun) -> Ended | Restored:
+    def end_of(self, query: Query, node: str, run: NodeRun) -> NodeEnded | Restored:
         """Return how a run has ended whose query is held; of a sub-graph, wait for that."""
         response = query.response
         if isinstance(response, ActionEnd):
             if response.result == INTERRUPTED:
                 return Restored((node,), run.number)
-            return Ended(node, run.number, response.result, response.outputs)
+            return NodeEnded(node, run.number, response.result, response.outputs)
         ended = wait_ended(query, None)
         result = "on_error" if ended.result == "on_halted" else ended.result
-        return Ended(node, run.number, result, ended.outputs, ended.why)
+        return NodeEnded(node, run.number, result, ended.outputs, ended.why)
 
     def tell_run(self, actor: str, key: str, word: Word, step: int) -> Callable[[float], str]:
         """Tell a run what holds for it, here or in another manager. Return a function that waits until the run has it.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from typing import Any
 
 import msgspec
 
@@ -13,6 +14,7 @@ from rr_actors.managers.actions.graph_model import (
     ActionNode,
     Parameter,
     ParentRelation,
+    accepts,
     known_types,
     wrong_graph,
 )
@@ -206,6 +208,25 @@ def missing_inputs(graph: ActionGraph, given: Collection[str] = ()) -> dict[str,
     """Return the required inputs of the entries that the graph has no value for, by name."""
     inputs = [item for entry in graph.entry for item in graph.nodes[entry].inputs.items()]
     return {name: one for name, one in inputs if one.required and not one.has_value and name not in given}
+
+
+def checked_inputs(graph: ActionGraph, inputs: dict[str, Any]) -> dict[str, Any]:
+    """Return the inputs of a run by flat names.
+
+    Raises:
+        GraphError: an entry has no such input, or does not accept the value; or a required input has none.
+    """
+    known = {name: one for entry in graph.entry for name, one in graph.nodes[entry].inputs.items()}
+    for name, value in inputs.items():
+        if name not in known:
+            raise wrong_graph(graph.file, f"inputs.{name}", f"an input: one of {', '.join(known) or 'none'}", name)
+        if not accepts(known[name], value):
+            allowed = known[name].allowed
+            expected = f"one of {', '.join(map(str, allowed))}" if allowed else f"a {known[name].type}"
+            raise wrong_graph(graph.file, f"inputs.{name}", expected, value)
+    for name, parameter in missing_inputs(graph, inputs).items():
+        raise wrong_graph(graph.file, f"inputs.{name}", f"a {parameter.type}", None)
+    return inputs
 
 
 def signature_of(graph: ActionGraph) -> Signature:

@@ -28,6 +28,9 @@ from rr_actors.managers.actions.graph_model import (
     likely_type,
     wrong_graph,
 )
+from rr_actors.managers.actions.graph_runs import GraphRun, NodeRun
+
+KEY = "rr_run"  # what the dialects have no key for
 
 _KEYS = {
     "graph": ("graph_name", "graph_description", "graph_entry", "graph_exit", "graph_state", "actions", "umrf_actions"),
@@ -297,3 +300,39 @@ class _Reader:
             self.get(table, "pvf_updatable", bool, path, True),
             allowed,
         )
+
+
+# -- runs --------------------------------------------------------------------------------------------------------------
+
+
+def feedback(graph: ActionGraph, run: GraphRun) -> dict[str, Any]:
+    """Return the JSON object of a graph with `graph_state`, and with the `state` of each action."""
+    key = "umrf_actions" if graph.dialect == 1 else "actions"
+    names = list(graph.nodes)  # in the order of the document
+    tables: list[dict[str, Any]] = graph.document[key]
+    actions = [{**table, "state": run.nodes[name].state} for name, table in zip(names, tables, strict=True)]
+    return {**graph.document, key: actions, "graph_state": run.state, KEY: _table(run)}
+
+
+def _table(run: GraphRun) -> dict[str, Any]:
+    """Return a run as a table. Inputs and outputs keep their types, as to_builtins() would not have it."""
+    nodes = [{name: _without_defaults(node) for name, node in some.items()} for some in (run.nodes, run.leaving)]
+    return {**msgspec.structs.asdict(run), "nodes": nodes[0], "leaving": nodes[1]}
+
+
+def _without_defaults(node: NodeRun) -> dict[str, Any]:
+    table = msgspec.structs.asdict(node)
+    return {key: value for key, value in table.items() if value != getattr(_FIRST, key)}
+
+
+_FIRST = NodeRun()
+
+
+def run_in(response: dict[str, Any]) -> GraphRun:
+    """Return the run in a response of `actions/graph`."""
+    return msgspec.convert(response[KEY], GraphRun)
+
+
+def document_in(response: dict[str, Any]) -> dict[str, Any]:
+    """Return the JSON object of the graph in a response, without the run."""
+    return {key: value for key, value in response.items() if key != KEY}

@@ -15,6 +15,7 @@ from typing import Any, Protocol
 from rr_actors.base.errors import CatalogError, RrError, Unavailable, UnknownQuery, text_of
 from rr_actors.base.reporting.log import Log
 from rr_actors.managers.actions.action import Word
+from rr_actors.managers.actions.graph_documents import feedback
 from rr_actors.managers.actions.graph_library import Shelf
 from rr_actors.managers.actions.graph_log import GraphLog
 from rr_actors.managers.actions.graph_model import ActionGraph
@@ -23,16 +24,15 @@ from rr_actors.managers.actions.graph_runs import (
     LIVE,
     Begin,
     Change,
-    Effect,
-    Ended,
     Event,
     GraphRun,
     Halt,
+    NodeEffect,
+    NodeEnded,
     NodeRun,
     Pause,
     Restored,
     decide,
-    feedback,
 )
 from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Query, Status
@@ -51,7 +51,7 @@ CONFIRMED_S = 5.0
 _WORDS: dict[str, Word] = {"RUNNING": "run", "PAUSED": "pause", "STOPPING": "stop"}
 
 
-class Runner(Protocol):
+class ActionRunner(Protocol):
     """What the manager does for an engine."""
 
     registrar: Registrar
@@ -64,7 +64,7 @@ class Runner(Protocol):
         """Run an action, and return its query when it has ended."""
         ...
 
-    def end_of(self, query: Query, node: str, run: NodeRun) -> Ended | Restored:
+    def end_of(self, query: Query, node: str, run: NodeRun) -> NodeEnded | Restored:
         """Return how a run has ended whose query is held, or that it is to run again; of a sub-graph, wait for that."""
         ...
 
@@ -90,7 +90,7 @@ class GraphEngine:
 
     def __init__(
         self,
-        runner: Runner,
+        runner: ActionRunner,
         graph_id: str,
         graph: ActionGraph,
         run: GraphRun,
@@ -183,7 +183,7 @@ class GraphEngine:
                 self._in_thread(name, self._follow, node, query)
                 self._tell_run(name, node)
             elif (end := ends.get(self._key(name, node))) is not None:
-                self._in_thread(name, self._take_end, Ended(name, node.number, *end))
+                self._in_thread(name, self._take_end, NodeEnded(name, node.number, *end))
             elif node.actor:
                 self._in_thread(name, self._wait_over, node)
             else:
@@ -223,7 +223,9 @@ class GraphEngine:
             if self._closed:
                 return []
             graph = event.graph if isinstance(event, Change) else self._graph
-            if isinstance(event, Ended) and (timer := self._stops.pop(self._run_key(event.node, event.number), None)):
+            if isinstance(event, NodeEnded) and (
+                timer := self._stops.pop(self._run_key(event.node, event.number), None)
+            ):
                 timer.cancel()
             left = self._run.leaving
             run, effects = decide(self._graph, self._run, event)
@@ -234,7 +236,7 @@ class GraphEngine:
                 if graph is not self._graph:
                     stale += self._take_kept(self._kept.keys() - graph.unchanged(self._graph))
                 self._graph, self._run = graph, run
-            if query is not None and isinstance(event, Ended):
+            if query is not None and isinstance(event, NodeEnded):
                 stale += [query] if event.node in left else self._replaced(event.node, query)
         self._release_all(stale)
         waits = [self._carry_out(graph, effect, run.node(effect.node), run.steps) for effect in effects]
@@ -263,11 +265,11 @@ class GraphEngine:
                 logger.info("%s: %s", self._graph.name, error)
                 return
             except Exception as error:
-                if not isinstance(event, Ended) or event.result == "on_error":
+                if not isinstance(event, NodeEnded) or event.result == "on_error":
                     self._lose(error)
                     return
                 logger.warning("%s: %s: its end cannot be kept", self._graph.name, event.node, exc_info=error)
-                event = Ended(event.node, event.number, "on_error", why=f"its end cannot be kept: {text_of(error)}")
+                event = NodeEnded(event.node, event.number, "on_error", why=f"its end cannot be kept: {text_of(error)}")
 
     def _lose(self, error: Exception) -> None:
         logger.error("%s: it cannot go on", self._graph.name, exc_info=error)
@@ -294,15 +296,15 @@ class GraphEngine:
     # -- on disk ---------------------------------------------------------------------------------------------------
 
     def _commit(self, graph: ActionGraph, run: GraphRun, event: Event) -> None:
-        text = f"{event.node}: {event.result}" if isinstance(event, Ended) else type(event).__name__.lower()
-        if not (isinstance(event, Ended) and run.state == self._run.state and self._note(run.steps, event)):
+        text = f"{event.node}: {event.result}" if isinstance(event, NodeEnded) else type(event).__name__.lower()
+        if not (isinstance(event, NodeEnded) and run.state == self._run.state and self._note(run.steps, event)):
             self._write(graph, run, text)
             return
         self._texts.append(text)
         if self._writing is None:
             self._write_later(self._write_at - time.monotonic())
 
-    def _note(self, step: int, event: Ended) -> bool:
+    def _note(self, step: int, event: NodeEnded) -> bool:
         """Write the end of an action to the log, if the response was written a short while ago."""
         return self._log is not None and time.monotonic() < self._write_at and self._log.append(step, event)
 
@@ -354,7 +356,7 @@ class GraphEngine:
     def _run_key(self, name: str, number: int) -> str:
         return f"{self.graph_id}/{name}/{number}"
 
-    def _carry_out(self, graph: ActionGraph, effect: Effect, node: NodeRun, step: int) -> Callable[[float], str]:
+    def _carry_out(self, graph: ActionGraph, effect: NodeEffect, node: NodeRun, step: int) -> Callable[[float], str]:
         if effect.do == "run":
             self._in_thread(effect.node, self._act, graph, node)
             return _confirmed
@@ -391,7 +393,7 @@ class GraphEngine:
             query = self._runner.begin_run(self.graph_id, graph, name, node, self._key(name, node))
         except Exception as error:
             if not self._runner.is_closing():
-                self._insist(Ended(name, node.number, "on_error", why=_why(error)))
+                self._insist(NodeEnded(name, node.number, "on_error", why=_why(error)))
             return
         self._follow(name, node, query)
 
@@ -400,7 +402,7 @@ class GraphEngine:
         try:
             end = self._runner.end_of(query, name, node)
         except Exception as error:
-            end = Ended(name, node.number, "on_error", why=_why(error))
+            end = NodeEnded(name, node.number, "on_error", why=_why(error))
         if self._runner.is_closing():
             return
         if isinstance(end, Restored):

@@ -17,7 +17,7 @@ from typing import Any
 from rr_actors.base.errors import CatalogError, RrError
 from rr_actors.base.folder import Folder, make_directories
 from rr_actors.base.values.canonical import Codec
-from rr_actors.managers.actions.graph_runs import Ended
+from rr_actors.managers.actions.graph_runs import NodeEnded
 from rr_actors.storage.journaled_store import RecordEnd, is_torn, record, records, write_whole
 
 _BEFORE, _AFTER = "graph-", ".log"
@@ -34,7 +34,7 @@ class GraphLog:
         self._file: io.FileIO | None = None
         self._end = _begin(path)
 
-    def append(self, step: int, event: Ended) -> bool:
+    def append(self, step: int, event: NodeEnded) -> bool:
         """Write the end that has made this step of the run. Return False, and write nothing, if it is too long.
 
         Raises:
@@ -55,7 +55,7 @@ class GraphLog:
             raise CatalogError(f"{self._path}: {error.strerror}", path=str(self._path)) from error
         return True
 
-    def since(self, step: int) -> list[Ended]:
+    def since(self, step: int) -> list[NodeEnded]:
         """Return the ends after this step of the run, in their order.
 
         Raises:
@@ -68,12 +68,12 @@ class GraphLog:
             return []
         except OSError as error:
             raise CatalogError(f"{self._path}: {error.strerror}", path=str(self._path)) from error
-        end, ends = _begin(self._path), list[Ended]()
+        end, ends = _begin(self._path), list[NodeEnded]()
         for body, after in records(data, end):
             end = after
             number, *rest = self._read(body)
             if number == step + len(ends) + 1:
-                ends.append(Ended(*rest))
+                ends.append(NodeEnded(*rest))
             elif number > step:
                 raise CatalogError(f"{self._path}: no record of step {step + len(ends) + 1}", path=str(self._path))
         if end.at < len(data) and not is_torn(data, end):

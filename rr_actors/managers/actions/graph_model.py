@@ -69,6 +69,34 @@ class ActionNode(msgspec.Struct, frozen=True):
     parents: dict[str, ParentRelation] = {}
     children: dict[str, dict[str, str]] = {}
 
+    def values(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what it runs with: the values that its graph has, and what it has been given."""
+        return {name: one.value for name, one in self.inputs.items() if one.has_value} | dict(given)
+
+    def lacking(self, given: Mapping[str, Any]) -> list[str]:
+        """Return the required inputs that have no value then."""
+        values = self.values(given)
+        return [name for name, one in self.inputs.items() if one.required and name not in values]
+
+    def takes(self, name: str, value: object) -> bool:
+        """Return whether an input of it can be given this value."""
+        one = self.inputs.get(name)
+        return one is not None and (one.updatable or not one.has_value) and accepts(one, value)
+
+    def handed_to(self, child: ActionNode, outputs: Mapping[str, Any]) -> dict[str, Any] | None:
+        """Return the outputs that a child takes, by its names; None if it does not accept one of them."""
+        names = self.children[child.name]
+        taken: dict[str, Any] = {}
+        for name, value in outputs.items():
+            to = names.get(name, name)
+            one = child.inputs.get(to)
+            if one is None or (one.has_value and not one.updatable):
+                continue
+            if not accepts(one, value):
+                return None
+            taken[to] = value
+        return taken
+
 
 class ActionGraph(msgspec.Struct, frozen=True):
     """A graph that has been read.

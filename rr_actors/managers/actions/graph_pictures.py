@@ -9,9 +9,8 @@ from typing import Any
 import msgspec
 
 from rr_actors.base.svg_pictures import Box, draw
-from rr_actors.managers.actions.graph_documents import read_graph, read_graph_file
+from rr_actors.managers.actions.graph_documents import KEY, document_in, read_graph, read_graph_file, run_in
 from rr_actors.managers.actions.graph_model import ActionGraph
-from rr_actors.managers.actions.graph_runs import KEY, document_in, run_in
 
 _COLOURS = {
     "RUNNING": "#cfe8ff",

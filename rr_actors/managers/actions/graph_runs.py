@@ -16,11 +16,10 @@ from typing import Any, Literal
 
 import msgspec
 
-from rr_actors.managers.actions.graph_checks import missing_inputs
-from rr_actors.managers.actions.graph_model import EXIT, ActionGraph, ActionNode, ParentRelation, accepts, wrong_graph
+from rr_actors.managers.actions.graph_checks import checked_inputs
+from rr_actors.managers.actions.graph_model import EXIT, ActionGraph, ActionNode, ParentRelation, wrong_graph
 
 MOST_ATTEMPTS = 3
-KEY = "rr_run"  # what the dialects have no key for
 
 LIVE = ("RUNNING", "PAUSED", "STOPPING")  # an action that runs
 _NOTHING = object()
@@ -96,7 +95,7 @@ class Begin(msgspec.Struct, frozen=True):
     in_pause: bool = False
 
 
-class Ended(msgspec.Struct, frozen=True):
+class NodeEnded(msgspec.Struct, frozen=True):
     """A run of an action has ended; `why`: with this error."""
 
     node: str
@@ -143,10 +142,10 @@ class Restored(msgspec.Struct, frozen=True):
     number: int = 0
 
 
-Event = Begin | Ended | Halt | Pause | Resume | Change | Restored
+Event = Begin | NodeEnded | Halt | Pause | Resume | Change | Restored
 
 
-class Effect(msgspec.Struct, frozen=True):
+class NodeEffect(msgspec.Struct, frozen=True):
     """What to do for one action: run it, or tell its run to stop, to pause, or to resume."""
 
     do: Literal["run", "stop", "pause", "resume"]
@@ -158,7 +157,7 @@ def first_run(graph: ActionGraph) -> GraphRun:
     return GraphRun(nodes={name: NodeRun() for name in graph.nodes})
 
 
-def decide(graph: ActionGraph, run: GraphRun, event: Event) -> tuple[GraphRun, tuple[Effect, ...]]:
+def decide(graph: ActionGraph, run: GraphRun, event: Event) -> tuple[GraphRun, tuple[NodeEffect, ...]]:
     """Return what a run becomes by an event, and what is to be done when that is on disk.
 
     An event that does not concern the run, such as the end of a run that is over, changes nothing. After Change, the
@@ -172,7 +171,7 @@ def decide(graph: ActionGraph, run: GraphRun, event: Event) -> tuple[GraphRun, t
     match event:
         case Begin():
             decision.begin(event.inputs, event.in_pause)
-        case Ended():
+        case NodeEnded():
             decision.ended(event)
         case Halt():
             decision.end("STOPPED", "on_stopped")
@@ -188,25 +187,6 @@ def decide(graph: ActionGraph, run: GraphRun, event: Event) -> tuple[GraphRun, t
     return decision.outcome()
 
 
-def checked_inputs(graph: ActionGraph, inputs: dict[str, Any]) -> dict[str, Any]:
-    """Return the inputs of a run by flat names.
-
-    Raises:
-        GraphError: an entry has no such input, or does not accept the value; or a required input has none.
-    """
-    known = {name: one for entry in graph.entry for name, one in graph.nodes[entry].inputs.items()}
-    for name, value in inputs.items():
-        if name not in known:
-            raise wrong_graph(graph.file, f"inputs.{name}", f"an input: one of {', '.join(known) or 'none'}", name)
-        if not accepts(known[name], value):
-            allowed = known[name].allowed
-            expected = f"one of {', '.join(map(str, allowed))}" if allowed else f"a {known[name].type}"
-            raise wrong_graph(graph.file, f"inputs.{name}", expected, value)
-    for name, parameter in missing_inputs(graph, inputs).items():
-        raise wrong_graph(graph.file, f"inputs.{name}", f"a {parameter.type}", None)
-    return inputs
-
-
 class _Decision:
     """The consequences of one event."""
 
@@ -215,11 +195,11 @@ class _Decision:
         self.state, self.result, self.ending, self.why = run.state, run.result, run.ending, run.why
         self.nodes, self.outputs, self.heard = dict(run.nodes), run.outputs, run.heard
         self.leaving = dict(run.leaving)
-        self.effects: list[Effect] = []
+        self.effects: list[NodeEffect] = []
         self.bypassed: set[str] = set()
         self.has_other_graph = False
 
-    def outcome(self) -> tuple[GraphRun, tuple[Effect, ...]]:
+    def outcome(self) -> tuple[GraphRun, tuple[NodeEffect, ...]]:
         changed = msgspec.structs.replace(
             self.before,
             state=self.state,
@@ -253,7 +233,7 @@ class _Decision:
             self.put(name, given={key: value for key, value in inputs.items() if key in known})
             self.start(name)
 
-    def ended(self, event: Ended) -> None:
+    def ended(self, event: NodeEnded) -> None:
         if event.node in self.leaving:
             self.left(event)
             return
@@ -313,15 +293,15 @@ class _Decision:
             if node is None or number not in (0, node.number):
                 continue
             if node.state == "STOPPING":
-                self.ended(Ended(name, node.number, "on_stopped"))
+                self.ended(NodeEnded(name, node.number, "on_stopped"))
             elif node.state == "PAUSED":  # nothing begins in a pause, and what a crash ends there is no attempt
                 self.put(name, lost=True)
             elif node.state in LIVE and node.attempt >= MOST_ATTEMPTS:
                 why = f"a crash has interrupted {name} in {MOST_ATTEMPTS} attempts"
-                self.ended(Ended(name, node.number, "on_error", why=why))
+                self.ended(NodeEnded(name, node.number, "on_error", why=why))
             elif node.state in LIVE:
                 self.put(name, attempt=node.attempt + 1)
-                self.effects.append(Effect("run", name))
+                self.effects.append(NodeEffect("run", name))
 
     def settle(self) -> None:
         """See whether the graph has come to its end, or cannot go on."""
@@ -343,9 +323,7 @@ class _Decision:
             waits_for = [parent for parent in required if parent not in node.heard]
             if node.heard and waits_for:
                 return f"nothing runs: {name} waits for {', '.join(waits_for)}"
-            if self.is_ready(name) and (
-                lacks := _lacking(self.graph.nodes[name], _values(self.graph.nodes[name], node.given))
-            ):
+            if self.is_ready(name) and (lacks := self.graph.nodes[name].lacking(node.given)):
                 return f"nothing runs: {name} has no value for {', '.join(lacks)}"
         return "every child ignores the result, and nothing runs"
 
@@ -392,7 +370,7 @@ class _Decision:
         if node.state in LIVE:
             self.leaving[name] = msgspec.structs.replace(node, state="STOPPING", again=False)
         if node.state in ("RUNNING", "PAUSED"):
-            self.effects.append(Effect("stop", name))
+            self.effects.append(NodeEffect("stop", name))
         return node.again or node.state in ("RUNNING", "PAUSED", "INITIALIZED")
 
     def taken_over(self, name: str, before: ActionGraph, stay: set[str]) -> NodeRun:
@@ -403,7 +381,7 @@ class _Decision:
         if name in stay:
             return msgspec.structs.replace(node, heard=heard)
         given = _given(before.nodes[name], node) if name in before.nodes else {}
-        taken = {key: value for key, value in given.items() if _takes(definition, key, value)}
+        taken = {key: value for key, value in given.items() if definition.takes(key, value)}
         left = self.leaving.get(name, node)
         return NodeRun(number=1 + max(self.before.steps, node.number, left.number), heard=heard, given=taken)
 
@@ -418,7 +396,7 @@ class _Decision:
         runs = {name: result for name, (response, result) in responses.items() if response in ("run", "restart")}
         return runs | {name: "" for name, (response, _) in responses.items() if response == "ignore"}
 
-    def left(self, event: Ended) -> None:
+    def left(self, event: NodeEnded) -> None:
         """Take the end of an action that the graph does not have any more: it means nothing to the others."""
         if self.leaving[event.node].number != event.number:
             return
@@ -448,7 +426,7 @@ class _Decision:
             GraphError: a required input has no value.
         """
         node = self.graph.nodes[name]
-        lacks = _lacking(node, _values(node, self.nodes[name].given))
+        lacks = node.lacking(self.nodes[name].given)
         if lacks and self.nodes[name].state not in LIVE:
             raise wrong_graph(self.graph.file, f"{node.place}.input_parameters.{lacks[0]}", "a value", None)
         if self.nodes[name].state == "STOPPING" and not lacks:
@@ -458,8 +436,8 @@ class _Decision:
     def start(self, name: str) -> None:
         """Run an action with what it was given, or note that it will run."""
         node = self.nodes[name]
-        inputs = _inputs(self.graph.nodes[name], node.given)
-        if inputs is None or node.state in LIVE:
+        definition = self.graph.nodes[name]
+        if definition.lacking(node.given) or node.state in LIVE:
             return
         if self.state == "PAUSED" or self.leaving:
             self.put(name, state="INITIALIZED", heard={})
@@ -471,22 +449,22 @@ class _Decision:
             attempt=1,
             heard={},
             given={},
-            inputs=inputs,
+            inputs=definition.values(node.given),
             again=False,
             why="",
             result="",
             actor=self.graph.nodes[name].actor,
         )
-        self.effects.append(Effect("run", name))
+        self.effects.append(NodeEffect("run", name))
 
     def stop(self, name: str) -> None:
         node = self.nodes[name]
         if node.lost:
             self.put(name, state="STOPPING", again=False, lost=False)
-            self.ended(Ended(name, node.number, "on_stopped"))
+            self.ended(NodeEnded(name, node.number, "on_stopped"))
         elif self.nodes[name].state in ("RUNNING", "PAUSED"):
             self.put(name, state="STOPPING", again=False)
-            self.effects.append(Effect("stop", name))
+            self.effects.append(NodeEffect("stop", name))
         elif self.nodes[name].state in ("INITIALIZED", "STOPPING"):
             state = "STOPPING" if self.nodes[name].state == "STOPPING" else "UNINITIALIZED"
             self.put(name, state=state, again=False)
@@ -503,11 +481,11 @@ class _Decision:
     def pause_node(self, name: str) -> None:
         if self.nodes[name].state == "RUNNING":
             self.put(name, state="PAUSED")
-            self.effects.append(Effect("pause", name))
+            self.effects.append(NodeEffect("pause", name))
 
     def resume_node(self, name: str) -> None:
         node = self.nodes[name]
-        self.effects.append(Effect("run" if node.lost else "resume", name))
+        self.effects.append(NodeEffect("run" if node.lost else "resume", name))
         self.put(name, state="RUNNING", number=node.number + node.lost, lost=False)
 
     # -- relations -------------------------------------------------------------------------------------------------
@@ -542,7 +520,7 @@ class _Decision:
 
     def hear(self, parent: str, child: str, response: str, result: str, outputs: dict[str, Any]) -> None:
         """Take a parent's outputs, and run the child if all its required parents have ended."""
-        given = _taken(self.graph.nodes[parent], self.graph.nodes[child], outputs)
+        given = self.graph.nodes[parent].handed_to(self.graph.nodes[child], outputs)
         if given is None:
             return  # a value that it does not accept: the parent means another child
         self.put(child, given={**self.nodes[child].given, **given})
@@ -593,30 +571,10 @@ class _Decision:
         self.end("ERROR" if result == "on_error" else "FINISHED", result)
 
 
-def _taken(parent: ActionNode, child: ActionNode, outputs: dict[str, Any]) -> dict[str, Any] | None:
-    """Return the outputs that a child takes, by its names; None if it does not accept one of them."""
-    names = parent.children[child.name]
-    taken: dict[str, Any] = {}
-    for name, value in outputs.items():
-        to = names.get(name, name)
-        parameter = child.inputs.get(to)
-        if parameter is None or (parameter.has_value and not parameter.updatable):
-            continue
-        if not accepts(parameter, value):
-            return None
-        taken[to] = value
-    return taken
-
-
 def _given(definition: ActionNode, node: NodeRun) -> dict[str, Any]:
     """Return what an action has been given besides the values of its graph, also for the run that goes on."""
     own = {name: one.value for name, one in definition.inputs.items() if one.has_value}
     return {key: value for key, value in node.inputs.items() if own.get(key, _NOTHING) != value} | node.given
-
-
-def _takes(definition: ActionNode, name: str, value: Any) -> bool:
-    parameter = definition.inputs.get(name)
-    return parameter is not None and (parameter.updatable or not parameter.has_value) and accepts(parameter, value)
 
 
 def _still_heard(heard: dict[str, str], relations: dict[str, ParentRelation], stay: set[str]) -> dict[str, str]:
@@ -624,53 +582,3 @@ def _still_heard(heard: dict[str, str], relations: dict[str, ParentRelation], st
     required = [name for name, relation in relations.items() if relation.required]
     found = {name: result for name, result in heard.items() if name in required and name in stay}
     return found if any(found.values()) or len(found) < len(required) else {}
-
-
-def _inputs(node: ActionNode, given: dict[str, Any]) -> dict[str, Any] | None:
-    """Return what an action runs with; None if a required input has no value."""
-    inputs = _values(node, given)
-    return None if _lacking(node, inputs) else inputs
-
-
-def _values(node: ActionNode, given: dict[str, Any]) -> dict[str, Any]:
-    return {name: one.value for name, one in node.inputs.items() if one.has_value} | given
-
-
-def _lacking(node: ActionNode, inputs: dict[str, Any]) -> list[str]:
-    return [name for name, one in node.inputs.items() if one.required and name not in inputs]
-
-
-# -- as JSON ---------------------------------------------------------------------------------------------------------
-
-
-def feedback(graph: ActionGraph, run: GraphRun) -> dict[str, Any]:
-    """Return the JSON object of a graph with `graph_state`, and with the `state` of each action."""
-    key = "umrf_actions" if graph.dialect == 1 else "actions"
-    names = list(graph.nodes)  # in the order of the document
-    tables: list[dict[str, Any]] = graph.document[key]
-    actions = [{**table, "state": run.nodes[name].state} for name, table in zip(names, tables, strict=True)]
-    return {**graph.document, key: actions, "graph_state": run.state, KEY: _table(run)}
-
-
-def _table(run: GraphRun) -> dict[str, Any]:
-    """Return a run as a table. Inputs and outputs keep their types, as to_builtins() would not have it."""
-    nodes = [{name: _without_defaults(node) for name, node in some.items()} for some in (run.nodes, run.leaving)]
-    return {**msgspec.structs.asdict(run), "nodes": nodes[0], "leaving": nodes[1]}
-
-
-def _without_defaults(node: NodeRun) -> dict[str, Any]:
-    table = msgspec.structs.asdict(node)
-    return {key: value for key, value in table.items() if value != getattr(_FIRST, key)}
-
-
-_FIRST = NodeRun()
-
-
-def run_in(response: dict[str, Any]) -> GraphRun:
-    """Return the run in a response of `actions/graph`."""
-    return msgspec.convert(response[KEY], GraphRun)
-
-
-def document_in(response: dict[str, Any]) -> dict[str, Any]:
-    """Return the JSON object of the graph in a response, without the run."""
-    return {key: value for key, value in response.items() if key != KEY}

@@ -14,15 +14,15 @@ import msgspec
 
 from rr_actors.base.names import NAME_WIDTH, in_short, made_at, short_id
 from rr_actors.base.values.canonical import shown_plain
-from rr_actors.managers.budgets.planner import LEAST, Running
+from rr_actors.managers.budgets.planner import LEAST, HeldShare
 from rr_actors.managers.budgets.requests import Share, Supply
-from rr_actors.managers.budgets.rings import Hold
+from rr_actors.managers.budgets.rings import RingHold
 from rr_actors.registrar.model.rows import STANDBY, Phase, Resource, ServedQuery, State, priority_of
 
 _HELD = (Phase.LOADED, Phase.UNLOADING, Phase.UNLOAD_FAILED)
 
 
-class Holding(msgspec.Struct, frozen=True):
+class BookEntry(msgspec.Struct, frozen=True):
     """A share or supply: its row, what it asks for, who holds it, and what it is a part of."""
 
     id: str
@@ -44,21 +44,29 @@ class Holding(msgspec.Struct, frozen=True):
 class Book(msgspec.Struct):
     """One pool: the shares that are held, by id, and what is given by which resource."""
 
-    shares: dict[str, Holding] = {}
+    shares: dict[str, BookEntry] = {}
     supplies: dict[str, float] = {}
 
     def used(self) -> float:
         """Return the sum of the shares."""
         return math.fsum(share.request.amount for share in self.shares.values())
 
+    def by_priority(self) -> dict[str, float]:
+        """Return the sums of the shares by priority, the highest first; "standby" is the last."""
+        sums: dict[int | None, float] = {}
+        for share in self.shares.values():
+            sums[share.priority] = sums.get(share.priority, 0.0) + share.request.amount
+        order = sorted(sums, key=lambda priority: math.inf if priority is None else -priority)
+        return {"standby" if priority is None else str(priority): sums[priority] for priority in order}
+
     def given(self) -> float:
         """Return the sum of the supplies."""
         return math.fsum(self.supplies.values())
 
-    def running(self, leaving: Container[str]) -> list[Running]:
+    def running(self, leaving: Container[str]) -> list[HeldShare]:
         """Return the shares for the planner. Those that lose theirs, or are being unloaded, are `leaving`."""
         return [
-            Running(id, one.request.amount, one.priority, made_at(id), id in leaving or one.is_lost)
+            HeldShare(id, one.request.amount, one.priority, made_at(id), id in leaving or one.is_lost)
             for id, one in self.shares.items()
         ]
 
@@ -85,7 +93,7 @@ class Books:
             ended: resources that are being released: what they give counts no more.
         """
         self.pools = {name: Book() for name in pools}
-        self.of: dict[str, Holding] = {}
+        self.of: dict[str, BookEntry] = {}
         for row, queries in rows:
             if row.server not in ("share", "supply"):
                 continue
@@ -102,10 +110,10 @@ class Books:
             elif _gives(one) and one.whole not in ended:
                 book.supplies[one.whole] = book.supplies.get(one.whole, 0.0) + one.request.amount
 
-    def holds(self, leaving: Container[str]) -> list[Hold]:
+    def holds(self, leaving: Container[str]) -> list[RingHold]:
         """Return all shares that are held, for the search for rings."""
         return [
-            Hold(pool, one.whole, one.request.amount, id in leaving or one.is_lost)
+            RingHold(pool, one.whole, one.request.amount, id in leaving or one.is_lost)
             for pool, book in self.pools.items()
             for id, one in book.shares.items()
         ]
@@ -126,17 +134,17 @@ def most_of(own: float, book: Book, reserves: Mapping[str, float]) -> float:
     return own + math.fsum([*others, *reserves.values()])
 
 
-def _holding(row: Resource, queries: Sequence[ServedQuery]) -> Holding | None:
+def _holding(row: Resource, queries: Sequence[ServedQuery]) -> BookEntry | None:
     request = _request(row.server, row.request)
     if request is None:
         return None
     priority = priority_of(max((query.priority for query in queries), default=STANDBY))
     whole = next((query.parent for query in queries if query.parent), "")
     holders = tuple(query.origin for query in queries)
-    return Holding(row.id, request, row.phase, row.state is State.FATAL, priority, holders, whole)
+    return BookEntry(row.id, request, row.phase, row.state is State.FATAL, priority, holders, whole)
 
 
-def _gives(one: Holding) -> bool:
+def _gives(one: BookEntry) -> bool:
     """Return whether a supply gives now: somebody needs what it is a part of, and that is not lost."""
     needed = one.priority is not None and one.priority > LEAST
     return one.phase is Phase.LOADED and not one.is_lost and needed

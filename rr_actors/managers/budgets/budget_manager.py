@@ -16,21 +16,22 @@ from typing import Any
 
 import msgspec
 
+from rr_actors.actors.actor_tables import TableColumn, table
 from rr_actors.base.errors import LoadFailed, NotFound, OverCapacity, UnknownQuery, UsageError, shown, text_of
 from rr_actors.base.names import made_at
 from rr_actors.base.reporting.log import Log
 from rr_actors.managers.budgets.books import Book, Books, most_of
 from rr_actors.managers.budgets.gauge import Gauge
 from rr_actors.managers.budgets.measures import Measure, next_capacity, surplus
-from rr_actors.managers.budgets.planner import LEAST, Asked, Plan, plan, urgencies
+from rr_actors.managers.budgets.planner import LEAST, AskedShare, BudgetPlan, plan, urgencies
 from rr_actors.managers.budgets.pools import Pool, check_amount, read_pools
 from rr_actors.managers.budgets.requests import PoolInfo, Share, Supply, check_request
-from rr_actors.managers.budgets.reserves import Record, Reserves
-from rr_actors.managers.budgets.rings import Wait, one_to_refuse, without_ground
+from rr_actors.managers.budgets.reserves import BudgetRecord, Reserves
+from rr_actors.managers.budgets.rings import RingWait, one_to_refuse, without_ground
 from rr_actors.managers.budgets.words import NAMED, Around, gives_way, has_room, waits
 from rr_actors.managers.planning.kept_record import KeptRecord
 from rr_actors.managers.planning.last_good import still_standing
-from rr_actors.managers.planning.planning_loop import Ended, PlanningLoop
+from rr_actors.managers.planning.planning_loop import PlanningLoop, StepEnded
 from rr_actors.managers.planning.probes import probe_of
 from rr_actors.managers.planning.setbacks import Setbacks
 from rr_actors.registrar.declarations import server
@@ -96,6 +97,7 @@ class Budgets(Manager):
         self._why: dict[str, str] = {}  # the text of their revocation
         self._refused: Setbacks[str] = Setbacks()  # revocations that could not begin
         self._infos: list[PoolInfo] = []
+        self._who: dict[str, dict[str, Any]] = {}  # of each pool, the shares by priority and those who wait
         self._measured = dict.fromkeys(self._pools, math.inf)
         self._problems = dict.fromkeys(self._pools, "")  # of the probes
         self._planning: PlanningLoop[tuple[str, str], str] = PlanningLoop("budgets", self._look, self._failed)
@@ -112,7 +114,9 @@ class Budgets(Manager):
 
     def on_start(self) -> None:
         """Go on with what was held, and with the reserves; look whether all of it still fits."""
-        self._record = KeptRecord(self.registrar.directory / "budgets.json", Record)  # if damaged, reserves start again
+        self._record = KeptRecord(
+            self.registrar.directory / "budgets.json", BudgetRecord
+        )  # if damaged, reserves start again
         now = self._record.now
         standing = still_standing(now.capacities, {name: pool.capacity for name, pool in self._pools.items()})
         if standing != now.capacities:
@@ -160,11 +164,27 @@ class Budgets(Manager):
         self._planning.look_and_wait(_LOOKED_S)
         return list(self._infos)
 
+    @table(
+        "pools",
+        TableColumn("name", "pool"),
+        TableColumn("used", kind="bar", of="capacity"),
+        TableColumn("free", kind="number"),
+        TableColumn("shares", "by priority"),
+        TableColumn("waiting", kind="number"),
+        TableColumn("who_waits", "who waits", "long"),
+        TableColumn("enforced", kind="yes"),
+        TableColumn("problem", kind="problem"),
+    )
+    def pool_rows(self) -> list[dict[str, Any]]:
+        """Return all pools as they are now, with the shares that are held by priority, and who waits."""
+        infos = self.pools()
+        return [msgspec.structs.asdict(info) | {"free": info.free} | self._who.get(info.name, {}) for info in infos]
+
     def on_receive(self, message: Any) -> list[dict[str, Any]]:
-        """Answer what `rr-actors budgets` asks."""
+        """Answer who asks for the pools by a message."""
         match message:
             case {"pools": None}:
-                return [msgspec.structs.asdict(info) | {"free": info.free} for info in self.pools()]
+                return self.pool_rows()
             case _:
                 raise UsageError(f"{self.registrar.name}: expected a question to Budgets, got {shown(message)}")
 
@@ -219,7 +239,7 @@ class Budgets(Manager):
             one.me.progress(1.0, has_room(one.share.pool, one.share.amount, max(0.0, time.monotonic() - one.since)))
         one.end(None)
 
-    def _refuse(self, books: Books, id: str, why: str = "") -> None:
+    def _refuse(self, books: Books, id: str, free: float, why: str = "") -> None:
         one = self._waiting.pop(id)
         share, server_id = one.share, f"{self.registrar.name}/share"
         if id not in books.of or not books.of[id].holders:
@@ -230,13 +250,11 @@ class Budgets(Manager):
         said = why or "; ".join(
             [f"held by {', '.join(sorted(holders)) or 'nobody'}", *self._reserves.failures(share.pool)]
         )
-        free = max(0.0, self._total(share.pool, book) - book.used())
         details = {"pool": share.pool, "asked": share.amount, "free": free, "holders": holders}
-        one.end(OverCapacity(f"{self._room(book, share)}; {said}", server=server_id, **details))
+        one.end(OverCapacity(f"{self._room(book, share, free)}; {said}", server=server_id, **details))
 
-    def _room(self, book: Book, share: Share) -> str:
+    def _room(self, book: Book, share: Share, free: float) -> str:
         total = self._total(share.pool, book)
-        free = max(0.0, total - book.used())
         return f"pool {shown(share.pool)}: asked {share.amount:g}, free {free:g} of {total:g}"
 
     # -- looking ---------------------------------------------------------------------------------------------------
@@ -245,7 +263,7 @@ class Budgets(Manager):
         """Compare what is wanted with what is there, begin what follows, and return when to look again."""
         books = Books(self._pools, served(self.registrar), self._admitted, self._reserves.ending(now))
         self._clean(books)
-        self._refuse_in_vain(books)
+        self._refuse_in_vain(books, now)
         waiting: dict[str, list[_Waiting]] = {name: [] for name in self._pools}
         for id in sorted(self._waiting):
             waiting[self._waiting[id].share.pool].append(self._waiting[id])
@@ -255,10 +273,19 @@ class Budgets(Manager):
         self._infos = [
             self._info(books, name, sum(one.id in self._waiting for one in waiting[name])) for name in self._pools
         ]
+        self._who = {name: self._shares(books, name, waiting[name]) for name in self._pools}
         later = [
             at for at in (*due, self._reserves.due(now), self._refused.next_at(now)) if at is not None and at > now
         ]
         return min(later, default=None)
+
+    def _shares(self, books: Books, name: str, waiting: Sequence[_Waiting]) -> dict[str, Any]:
+        by_priority = books.pools[name].by_priority()
+        return {
+            "by_priority": by_priority,
+            "shares": [f"{priority}: {amount:g}" for priority, amount in by_priority.items()],
+            "who_waits": [books.name_of(one.id) for one in waiting if one.id in self._waiting],
+        }
 
     def _clean(self, books: Books) -> None:
         """Forget what the rows say by now, and what has gone."""
@@ -267,16 +294,16 @@ class Budgets(Manager):
         self._why = {id: why for id, why in self._why.items() if id in self._leaving}
         self._refused.keep_only(self._leaving)
 
-    def _refuse_in_vain(self, books: Books) -> None:
+    def _refuse_in_vain(self, books: Books, now: float) -> None:
         """Refuse those who wait in rings, and those who lose another share, at once."""
         holds = books.holds(self._leaving)
         waits_now = [
-            Wait(id, one.share.pool, books.of[id].whole, one.share.amount, books.of[id].priority, one.since)
+            RingWait(id, one.share.pool, books.of[id].whole, one.share.amount, books.of[id].priority, one.since)
             for id, one in self._waiting.items()
             if id in books.of and books.of[id].whole
         ]
         for wait in without_ground(holds, waits_now):
-            self._refuse(books, wait.id, "what it is for loses a share of another pool")
+            self._refuse_now(books, wait, "what it is for loses a share of another pool", now)
         while True:
             left = [wait for wait in waits_now if wait.id in self._waiting]
             most = {name: self._most(name, book) for name, book in books.pools.items()}
@@ -287,21 +314,25 @@ class Budgets(Manager):
                 f"{books.name_of(wait.id)} waits for pool {shown(wait.pool)}" for wait in ring[1:][:NAMED]
             )
             why = f"a ring: what it is for has a share that others wait for, and {others or 'it waits for more of it'}"
-            self._refuse(books, ring[0].id, f"{why}; load the shares of several pools in one order")
+            self._refuse_now(books, ring[0], f"{why}; load the shares of several pools in one order", now)
+
+    def _refuse_now(self, books: Books, wait: RingWait, why: str, now: float) -> None:
+        """Refuse one before its pool is planned."""
+        waiting = [one for one in self._waiting.values() if one.share.pool == wait.pool]
+        _, made = self._made(books, wait.pool, waiting, now)
+        self._refuse(books, wait.id, made.free[wait.id], why)
 
     def _plan(self, books: Books, name: str, waiting: list[_Waiting], now: float) -> float | None:
         """Plan for one pool, and begin what the plan says. Return when to plan again."""
-        book, pool = books.pools[name], self._pools[name]
+        book, total = books.pools[name], self._total(name, books.pools[name])
         waiting = [one for one in waiting if one.id in self._waiting]
-        total, most = self._total(name, book), self._most(name, book)
         running = book.running(self._leaving)
-        asked = [self._asked(books, one, most, now) for one in waiting]
-        made = plan(total, pool.policy, running, asked, self._reserves.spares(name, book, now))
+        asked, made = self._made(books, name, waiting, now)
         for id in made.admit:
             book.shares[id] = books.of[id]
             self._admit(id)
         for id in made.refuse:
-            self._refuse(books, id)
+            self._refuse(books, id, made.free[id])
         if made.revoke:
             stays = math.fsum(one.amount for one in running if not one.leaving)
             less = total if stays > total else None
@@ -319,15 +350,26 @@ class Budgets(Manager):
         times = [told_at, *(one.until for one in waiting), *(one.since + _HOLDS_S for one in waiting)]
         return min((at for at in times if at > now), default=None)
 
-    def _asked(self, books: Books, one: _Waiting, most: float, now: float) -> Asked:
+    def _made(
+        self, books: Books, name: str, waiting: Sequence[_Waiting], now: float
+    ) -> tuple[list[AskedShare], BudgetPlan]:
+        """Return what those who wait ask for, and the plan for one pool."""
+        book = books.pools[name]
+        most = self._most(name, book)
+        asked = [self._asked(books, one, most, now) for one in waiting]
+        total, policy = self._total(name, book), self._pools[name].policy
+        spares = self._reserves.spares(name, book, now)
+        return asked, plan(total, policy, book.running(self._leaving), asked, spares)
+
+    def _asked(self, books: Books, one: _Waiting, most: float, now: float) -> AskedShare:
         row = books.of.get(one.id)
         wanted = row is not None and bool(row.holders)
         priority = row.priority if row is not None else None
         may_wait = wanted and one.share.amount <= most * (1 + 1e-9) and now < one.until
         holds = now >= one.since + _HOLDS_S and priority is not None and priority > LEAST
-        return Asked(one.id, one.share.amount, priority, one.since, may_wait, holds)
+        return AskedShare(one.id, one.share.amount, priority, one.since, may_wait, holds)
 
-    def _say(self, books: Books, name: str, made: Plan, now: float) -> float:
+    def _say(self, books: Books, name: str, made: BudgetPlan, now: float) -> float:
         """Tell those who wait behind whom. Return when to tell those who are far behind."""
         book, again_at = books.pools[name], 0.0
         leaving = [id for id, one in book.shares.items() if id in self._leaving or one.is_lost]
@@ -339,7 +381,7 @@ class Budgets(Manager):
                 again_at = max(again_at, one.said_at + _SAYS_S)
                 continue
             around = Around(made.wait[: min(at, NAMED)], max(0, at - NAMED), leaving, holding, starting)
-            said = waits(self._room(book, one.share), around, books.name_of)
+            said = waits(self._room(book, one.share, made.free[id]), around, books.name_of)
             if said != one.said:
                 one.said, one.said_at = said, now
                 one.me.progress(0.0, said)  # an event; `rr-actors why`, `loads` and `resources` show it, too
@@ -355,7 +397,7 @@ class Budgets(Manager):
                 start = functools.partial(begin_revocation, self.registrar, id, why, self._grace_s)
                 self._planning.begin(key, id, start, functools.partial(self._revoked, id))
 
-    def _revoked(self, id: str, ended: Ended) -> None:
+    def _revoked(self, id: str, ended: StepEnded) -> None:
         if ended.error is not None and not isinstance(ended.error, UnknownQuery):
             if self._refused.get(id) is None:
                 logger.warning("a share cannot be revoked, and is tried again: %s", text_of(ended.error))

@@ -23,7 +23,7 @@ _IDLE = -math.inf
 _TOLERANCE = 1e-9  # of the capacity: 0.1 + 0.2 fits into 0.3
 
 
-class Running(msgspec.Struct, frozen=True):
+class HeldShare(msgspec.Struct, frozen=True):
     """A share that is held. `since` orders shares by age; `priority` None is idle; `leaving`: it is revoked already."""
 
     id: str
@@ -33,7 +33,7 @@ class Running(msgspec.Struct, frozen=True):
     leaving: bool = False
 
 
-class Asked(msgspec.Struct, frozen=True):
+class AskedShare(msgspec.Struct, frozen=True):
     """A share that is asked for.
 
     Attributes:
@@ -49,7 +49,7 @@ class Asked(msgspec.Struct, frozen=True):
     holds: bool = False
 
 
-class Spare(msgspec.Struct, frozen=True):
+class SpareReserve(msgspec.Struct, frozen=True):
     """A reserve that could add to the capacity. What an `on` one adds is in the capacity already.
 
     A `late` one has been starting for so long that what is over the capacity cannot wait for it. Without `may_stop`, it
@@ -62,7 +62,7 @@ class Spare(msgspec.Struct, frozen=True):
     may_stop: bool = True
 
 
-class Plan(msgspec.Struct):
+class BudgetPlan(msgspec.Struct):
     """What to do, by ids.
 
     Attributes:
@@ -71,6 +71,7 @@ class Plan(msgspec.Struct):
         revoke: shares to revoke.
         wait: who asked and goes on waiting, for room that is being made, or for others to release theirs.
         refuse: who asked and gets nothing.
+        free: how much each who asked could have at once: without what others have, or are to get before.
     """
 
     admit: list[str] = []
@@ -79,15 +80,16 @@ class Plan(msgspec.Struct):
     revoke: list[str] = []
     wait: list[str] = []
     refuse: list[str] = []
+    free: dict[str, float] = {}
 
 
 def plan(
     capacity: float,
     policy: Sequence[Step],
-    running: Sequence[Running],
-    asked: Sequence[Asked] = (),
-    reserves: Sequence[Spare] = (),
-) -> Plan:
+    running: Sequence[HeldShare],
+    asked: Sequence[AskedShare] = (),
+    reserves: Sequence[SpareReserve] = (),
+) -> BudgetPlan:
     """Return what is to be done in one pool.
 
     No victim has the priority of the one that gets its room, or a higher one, unless the capacity has become less than
@@ -106,7 +108,7 @@ def plan(
 
 
 def urgencies(
-    capacity: float, running: Sequence[Running], asked: Sequence[Asked], reserves: Sequence[Spare]
+    capacity: float, running: Sequence[HeldShare], asked: Sequence[AskedShare], reserves: Sequence[SpareReserve]
 ) -> dict[str, int]:
     """Return how urgent each reserve is that is on or starting: as the most urgent share that would not fit without it.
 
@@ -123,7 +125,7 @@ def urgencies(
     sums: list[tuple[float, float]] = []  # with each share, the most urgent first: the sum so far, and its rank
     needed = 0.0
     for share in sorted([*running, *asked], key=lambda one: (-_rank(one.priority), one.since)):
-        if isinstance(share, Asked) and needed + share.amount > most:
+        if isinstance(share, AskedShare) and needed + share.amount > most:
             continue
         needed += share.amount
         sums.append((needed, _rank(share.priority)))
@@ -142,8 +144,8 @@ def _rank(priority: int | None) -> float:
 class _Room(NamedTuple):
     """Shares that are to be revoked, by steps of the policy before "supply", and by later ones."""
 
-    first: list[Running]
-    later: list[Running]
+    first: list[HeldShare]
+    later: list[HeldShare]
 
 
 class _Planning:
@@ -156,12 +158,12 @@ class _Planning:
         holding: somebody waits for a reserve first.
     """
 
-    def __init__(self, capacity: float, running: Sequence[Running], reserves: Sequence[Spare]) -> None:
-        self.made = Plan()
+    def __init__(self, capacity: float, running: Sequence[HeldShare], reserves: Sequence[SpareReserve]) -> None:
+        self.made = BudgetPlan()
         self._reserves = reserves
         self._off = [spare for spare in reserves if spare.state == "off"]
         self._slack = (capacity + total(reserves)) * _TOLERANCE
-        self._levels: dict[float, list[Running]] = {}  # what may be revoked, by priority
+        self._levels: dict[float, list[HeldShare]] = {}  # what may be revoked, by priority
         for share in running:
             if not share.leaving:
                 self._levels.setdefault(_rank(share.priority), []).append(share)
@@ -186,8 +188,9 @@ class _Planning:
             self._start(list(self._off))
         self._revoke(room.first + room.later)
 
-    def place(self, one: Asked, policy: Sequence[Step]) -> None:
+    def place(self, one: AskedShare, policy: Sequence[Step]) -> None:
         """Admit one, or make room for it, or let it wait, or refuse it."""
+        self.made.free[one.id] = max(0.0, min(self.free, self.ahead))
         need = one.amount - self.ahead - self._slack
         waits = one.patient and "wait" in policy
         steps = policy[: policy.index("wait")] if waits else policy
@@ -271,16 +274,16 @@ class _Planning:
         self._start(chosen)
         return total(chosen)
 
-    def _start(self, spares: list[Spare]) -> None:
+    def _start(self, spares: list[SpareReserve]) -> None:
         self._off = [spare for spare in self._off if spare not in spares]
         self.made.start += [spare.id for spare in spares]
         self.coming += total(spares)
         self.ahead += total(spares)
 
-    def _revoke(self, shares: list[Running]) -> None:
+    def _revoke(self, shares: list[HeldShare]) -> None:
         self.made.revoke += [share.id for share in shares]
 
-    def _victims(self, level: float, need: float) -> list[Running]:
+    def _victims(self, level: float, need: float) -> list[HeldShare]:
         shares = sorted(self._levels[level], key=lambda share: share.since)
         chosen = fewest_newest(shares, need)
         ids = {share.id for share in chosen}

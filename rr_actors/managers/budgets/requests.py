@@ -40,6 +40,9 @@ class Share(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     instance: str = msgspec.field(default_factory=_whose)
     whose: str = msgspec.field(default_factory=_whose_name)
 
+    def __rr_title__(self) -> str:
+        return f"{self.amount:g} of {self.pool}{f' for {self.whose}' if self.whose else ''}"
+
 
 class Supply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The request to add to a pool's capacity. Load it as a part, as the last of the load callback.
@@ -50,6 +53,9 @@ class Supply(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pool: str
     amount: float
     instance: str = msgspec.field(default_factory=_whose)
+
+    def __rr_title__(self) -> str:
+        return f"{self.amount:g} to {self.pool}"
 
 
 class PoolInfo(msgspec.Struct, frozen=True):

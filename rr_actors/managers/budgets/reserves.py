@@ -19,10 +19,10 @@ from rr_actors.base.errors import CatalogError, UnknownQuery, text_of
 from rr_actors.base.names import is_planned, made_at
 from rr_actors.base.reporting.log import Log
 from rr_actors.managers.budgets.books import Book
-from rr_actors.managers.budgets.planner import LEAST, Plan, Spare
+from rr_actors.managers.budgets.planner import LEAST, BudgetPlan, SpareReserve
 from rr_actors.managers.budgets.pools import Pool, Reserve, Sink
 from rr_actors.managers.planning.kept_record import KeptRecord
-from rr_actors.managers.planning.planning_loop import Ended, PlanningLoop
+from rr_actors.managers.planning.planning_loop import PlanningLoop, StepEnded
 from rr_actors.managers.planning.setbacks import Setbacks
 from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Query, Status
@@ -36,7 +36,7 @@ _SETTLES_S = 2.0  # so long a supply may take to follow what it is a part of
 _AGAIN = Backoff(delay_s=1.0, factor=2.0, maximum_s=30.0, jitter=0.0)
 
 
-class Record(msgspec.Struct):
+class BudgetRecord(msgspec.Struct):
     """What a Budgets manager keeps beside its catalog."""
 
     capacities: dict[str, tuple[float, float]] = {}  # of the pool: the file's, and the one that was set in its place
@@ -60,7 +60,7 @@ class Reserves:
         pools: Mapping[str, Pool],
         registrar: Registrar,
         planning: PlanningLoop[tuple[str, str], str],
-        record: KeptRecord[Record],
+        record: KeptRecord[BudgetRecord],
         grace_s: float,
     ) -> None:
         """Go on with those that are held. Release those that a crash has left before they were noted."""
@@ -125,24 +125,24 @@ class Reserves:
                 found.append(f"reserve {self._all[key].server} cannot be loaded: {setback.text}")
         return found
 
-    def spares(self, pool: str, book: Book, now: float) -> list[Spare]:
+    def spares(self, pool: str, book: Book, now: float) -> list[SpareReserve]:
         """Return the reserves of a pool for the planner."""
-        found: list[Spare] = []
+        found: list[SpareReserve] = []
         for key in self._keys[pool]:
             amount, one = self._all[key].amount, self._on.get(key)
             start = self._planning.in_flight.get(("start", key))
             if start is not None:
-                found.append(Spare(key, amount, "starting" if now < start.since + self._grace_s else "late"))
+                found.append(SpareReserve(key, amount, "starting" if now < start.since + self._grace_s else "late"))
             elif one is None:
                 if self._failed.may_try(key, now):
-                    found.append(Spare(key, amount))
+                    found.append(SpareReserve(key, amount))
             elif key not in self._owed:
                 gives = book.supplies.get(one.query.resource_id)
                 if gives is None and now < one.since + _SETTLES_S:
-                    found.append(Spare(key, amount, "starting"))
+                    found.append(SpareReserve(key, amount, "starting"))
                 else:
                     may_stop = now >= one.since + self._all[key].least_on_s
-                    found.append(Spare(key, amount if gives is None else gives, "on", may_stop))
+                    found.append(SpareReserve(key, amount if gives is None else gives, "on", may_stop))
         return found
 
     def due(self, now: float) -> float | None:
@@ -162,8 +162,8 @@ class Reserves:
     def carry_out(
         self,
         pool: str,
-        made: Plan,
-        urgent: Callable[[list[Spare]], dict[str, int]],
+        made: BudgetPlan,
+        urgent: Callable[[list[SpareReserve]], dict[str, int]],
         book: Book,
         total: float,
         now: float,
@@ -179,7 +179,7 @@ class Reserves:
         for key in made.stop:
             self._stop(key, book, total)
         spares = self.spares(pool, book, now)
-        spares = [Spare(one.id, one.amount, "starting" if one.id in made.start else one.state) for one in spares]
+        spares = [SpareReserve(one.id, one.amount, "starting" if one.id in made.start else one.state) for one in spares]
         priorities = urgent(spares)
         for key in made.start:
             self._start(key, priorities[key])
@@ -189,7 +189,7 @@ class Reserves:
                 set_it = functools.partial(self._registrar.set_priority, one.query, priority)
                 self._planning.begin_call(("rank", key), key, set_it, functools.partial(self._ranked, one, priority))
 
-    def _ranked(self, one: _On, priority: int, ended: Ended) -> None:
+    def _ranked(self, one: _On, priority: int, ended: StepEnded) -> None:
         one.priority = priority
         if ended.error is not None:
             logger.warning("a reserve has not the priority %d: %s", priority, text_of(ended.error))
@@ -225,7 +225,7 @@ class Reserves:
         started = functools.partial(self._started, key, priority)
         self._planning.begin(("start", key), key, start, started, limit_s=_RESERVE_S)
 
-    def _started(self, key: str, priority: int, ended: Ended) -> None:
+    def _started(self, key: str, priority: int, ended: StepEnded) -> None:
         if ended.value is None:
             self._note_failure(key, text_of(ended.error) if ended.error is not None else f"not within {_RESERVE_S:g} s")
             return
@@ -235,7 +235,7 @@ class Reserves:
         self._record.now.reserves[key] = one.query.id
         self._record.save()
         try:
-            if self._registrar.fetch_state(one.query) == State.FATAL:  # the status came before
+            if self._registrar.fetch_state(one.query) is State.FATAL:  # the status came before
                 self._give_up(key, "it has failed")
         except UnknownQuery:
             self._give_up(key, "it was lost")
@@ -274,7 +274,7 @@ class Reserves:
                 start = functools.partial(self._registrar.unload, query_id, block=False)
                 self._planning.begin(("stop", key), key, start, functools.partial(self._released, key))
 
-    def _released(self, key: str, ended: Ended) -> None:
+    def _released(self, key: str, ended: StepEnded) -> None:
         if isinstance(ended.error, CatalogError):  # the registrar has logged it
             self._refused.note(key, time.monotonic())
             return

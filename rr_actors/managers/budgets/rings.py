@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 import msgspec
 
 
-class Hold(msgspec.Struct, frozen=True):
+class RingHold(msgspec.Struct, frozen=True):
     """A share that `whole`, a resource, has of a pool. `leaving`: it is revoked."""
 
     pool: str
@@ -21,7 +21,7 @@ class Hold(msgspec.Struct, frozen=True):
     leaving: bool = False
 
 
-class Wait(msgspec.Struct, frozen=True):
+class RingWait(msgspec.Struct, frozen=True):
     """A share of a pool that `whole` waits for."""
 
     id: str
@@ -32,7 +32,9 @@ class Wait(msgspec.Struct, frozen=True):
     since: float = 0.0
 
 
-def one_to_refuse(most: Mapping[str, float], holds: Sequence[Hold], waits: Sequence[Wait]) -> tuple[Wait, ...]:
+def one_to_refuse(
+    most: Mapping[str, float], holds: Sequence[RingHold], waits: Sequence[RingWait]
+) -> tuple[RingWait, ...]:
     """Return a ring of waiting, the wait to be refused first; () if there is none.
 
     A share can be released if the resource that has it waits for nothing, or for what it can get. What cannot be got
@@ -57,7 +59,7 @@ def one_to_refuse(most: Mapping[str, float], holds: Sequence[Hold], waits: Seque
     return tuple(sorted(in_ring, key=lambda wait: (_rank(wait.priority), -wait.since)))
 
 
-def without_ground(holds: Sequence[Hold], waits: Sequence[Wait]) -> list[Wait]:
+def without_ground(holds: Sequence[RingHold], waits: Sequence[RingWait]) -> list[RingWait]:
     """Return the waits of resources that lose a share that they have: they will never get the rest."""
     losing = {hold.whole for hold in holds if hold.leaving and hold.whole}
     return [wait for wait in waits if wait.whole in losing]

@@ -9,8 +9,8 @@ from typing import cast
 from msgspec.structs import replace
 
 from rr_actors.managers.choices.alternatives import Alternative
-from rr_actors.managers.choices.chosen import Chosen, Held, chosen_of
-from rr_actors.managers.choices.relays import Address, Relays, parse_address
+from rr_actors.managers.choices.chosen import Chosen, HeldChoice, chosen_of
+from rr_actors.managers.choices.relays import Relays, SocketAddress, parse_address
 from rr_actors.registrar.queries import Query
 
 
@@ -22,7 +22,7 @@ class Addresses:
         self._directory, self._hosts = directory, hosts
         self._relays = Relays()
 
-    def made(self, id: str, held: Held, one: Alternative, query: Query) -> Chosen:
+    def made(self, id: str, held: HeldChoice, one: Alternative, query: Query) -> Chosen:
         """Return the response of a choice with this part; open its relay if it is to have one.
 
         Raises:
@@ -60,10 +60,10 @@ class Addresses:
         """Close all relays."""
         self._relays.stop()
 
-    def _new_address(self, id: str, source: Address) -> Address:
-        return Address("127.0.0.1") if source.port else Address(str(self._directory / f"{id[-12:]}.sock"))
+    def _new_address(self, id: str, source: SocketAddress) -> SocketAddress:
+        return SocketAddress("127.0.0.1") if source.port else SocketAddress(str(self._directory / f"{id[-12:]}.sock"))
 
-    def _source_of(self, chosen: Chosen) -> Address:
+    def _source_of(self, chosen: Chosen) -> SocketAddress:
         given: object = chosen.response
         if isinstance(given, dict):
             given = cast("dict[str, object]", given).get("address")

@@ -12,7 +12,7 @@ import msgspec
 
 from rr_actors.base.errors import NotFound, Unavailable, UsageError, few, shown
 from rr_actors.base.names import short_id
-from rr_actors.managers.choices.chosen import Held
+from rr_actors.managers.choices.chosen import HeldChoice
 from rr_actors.managers.planning.kept_record import KeptRecord
 
 _PART = 4  # characters of an id
@@ -84,14 +84,14 @@ class ChosenByHand:
             self._record.now.by_hand = before
             raise Unavailable(f"choice {short_id(id)}: what is chosen by hand cannot be written; nothing has changed")
 
-    def keep_only(self, choices: Mapping[str, Held]) -> None:
+    def keep_only(self, choices: Mapping[str, HeldChoice]) -> None:
         """Forget what was chosen for choices that are no more."""
         before = self._record.now.by_hand
         self._record.now.by_hand = {id: one for id, one in before.items() if id in choices}
         if len(self._record.now.by_hand) < len(before):
             self._record.save()
 
-    def info(self, id: str, held: Held, allowed: Sequence[str]) -> ChoiceInfo:
+    def info(self, id: str, held: HeldChoice, allowed: Sequence[str]) -> ChoiceInfo:
         """Return how a choice is; `allowed` are the keys of what it allows now."""
         place = id, held.request.kind, held.present, tuple(allowed)
         by_hand = self._record.now.by_hand.get(id)
@@ -107,7 +107,7 @@ class ChosenByHand:
         return ChoiceInfo(*place, by_hand.key, by_hand.by, by_hand.at, why)
 
 
-def find_choice(text: object, choices: Mapping[str, Held]) -> str:
+def find_choice(text: object, choices: Mapping[str, HeldChoice]) -> str:
     """Return the id of the choice that a text means: its id, the beginning or end of that, or a kind that one has.
 
     Raises:

@@ -16,6 +16,7 @@ from typing import Any
 
 import msgspec
 
+from rr_actors.actors.actor_tables import TableColumn, table
 from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base.checks import is_number
 from rr_actors.base.errors import (
@@ -28,6 +29,7 @@ from rr_actors.base.errors import (
     UnknownServer,
     UsageError,
     shown,
+    text_of,
 )
 from rr_actors.base.names import new_id, short_id
 from rr_actors.base.reporting.log import Log
@@ -36,17 +38,17 @@ from rr_actors.managers.choices.addresses import Addresses
 from rr_actors.managers.choices.alternatives import Alternative, check_rings, read_alternatives
 from rr_actors.managers.choices.by_hand import ByHand, ChoiceInfo, ChoicesRecord, ChosenByHand, find_choice, find_key
 from rr_actors.managers.choices.choice_search import ChoiceSearch, breaks_first, loading_of
-from rr_actors.managers.choices.chosen import Choose, Chosen, Held, held_choice
+from rr_actors.managers.choices.chosen import Choose, Chosen, HeldChoice, held_choice
 from rr_actors.managers.choices.labelled import Labelled
 from rr_actors.managers.choices.offers import Offers, nothing_left
-from rr_actors.managers.choices.planning import Choice, in_turn
+from rr_actors.managers.choices.planning import ChoiceState, in_turn
 from rr_actors.managers.choices.trials import FAILED, Trials
 from rr_actors.managers.planning.blame import is_own_failure, is_own_fault, part_of
 from rr_actors.managers.planning.hedging import HEDGE_S
 from rr_actors.managers.planning.kept_record import KeptRecord
 from rr_actors.managers.planning.reliability import Reliabilities
 from rr_actors.managers.planning.retries import SOON_S, Retries
-from rr_actors.managers.planning.searches import Loading, groups, release_soon, strays
+from rr_actors.managers.planning.searches import CandidateLoad, groups, release, release_soon, strays
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.manager import Manager
 from rr_actors.registrar.model.rows import LOWEST, Phase, State
@@ -97,15 +99,16 @@ class Choices(Manager):
             if not host or not isinstance(host, str):  # pyright: ignore[reportUnnecessaryIsInstance]
                 raise wrong(None, f"relay_hosts[{i}]", "the name or number of a host", host, where="Choices")
         self._relay_hosts = tuple(relay_hosts)
-        self._changed = threading.Condition(threading.RLock())
+        self._lock = threading.RLock()
         self._trials = Trials(
-            self._changed,
+            self._lock,
             settle_s,
             self._choices,
             self._load_on_trial,
             self._have_taken,
             lambda: self._offers.has_changed(),
             lambda: strays(self.registrar, self._begun),
+            self._failed,
         )
         self._begun = ""
 
@@ -116,7 +119,7 @@ class Choices(Manager):
             ConfigError: alternatives hold each other in a ring.
         """
         check_rings(self._given, f"{self.registrar.name}/choice", self._allowed_keys)
-        with self._changed:
+        with self._lock:
             held = dict(self._held)
             self._begun = new_id()
             self._by_hand.keep_only(held)
@@ -129,7 +132,7 @@ class Choices(Manager):
         self._trials.start()
 
     def on_stop(self) -> None:
-        """End the thread of the trials, and close the relays."""
+        """End the trials, and close the relays."""
         self._trials.stop()
         self._addresses.stop()
 
@@ -152,7 +155,7 @@ class Choices(Manager):
             UsageError: several are meant.
             Unavailable: the disk refuses it. Nothing has changed.
         """
-        with self._changed:
+        with self._lock:
             id = find_choice(choice, self._held)
             held = self._held[id]
             key = find_key(alternative, [one.key for one in self._offers.allowed_now(held.request)])
@@ -169,7 +172,7 @@ class Choices(Manager):
         Raises:
             RrError: as choose(); or UsageError: nothing was chosen for it by hand.
         """
-        with self._changed:
+        with self._lock:
             id = find_choice(choice, self._held)
             held = self._held[id]
             if not self._by_hand.key(id):
@@ -181,15 +184,37 @@ class Choices(Manager):
 
     def choices(self) -> list[ChoiceInfo]:
         """Return all choices as they are now."""
-        with self._changed:
+        with self._lock:
             held = dict(self._held)
         return [self._info(id, one) for id, one in held.items()]
+
+    @table(
+        "choices",
+        TableColumn("id", kind="id"),
+        TableColumn("kind"),
+        TableColumn("present", "in use", "long"),
+        TableColumn("by_hand", "by hand", "long"),
+        TableColumn("by"),
+        TableColumn("why", "why not", "problem"),
+        TableColumn("passed_over", "passed over", "problem"),
+    )
+    def choice_rows(self) -> list[dict[str, Any]]:
+        """Return all choices as they are now, with why those that are better than the one in use were passed over."""
+        with self._lock:
+            held = dict(self._held)
+        rows: list[dict[str, Any]] = []
+        for id, one in held.items():
+            info = self._info(id, one)
+            better = info.allowed[: info.allowed.index(info.present)] if info.present in info.allowed else info.allowed
+            why = {key: one.failures.get(key, "it is not known to be well yet") for key in better}
+            rows.append(msgspec.structs.asdict(info) | {"passed_over": why})
+        return rows
 
     def on_receive(self, message: Any) -> list[dict[str, Any]]:
         """Answer what `rr-actors choices` and `rr-actors choose` ask."""
         match message:
             case {"choices": None}:
-                found = self.choices()
+                return self.choice_rows()
             case {"choose": choice, "alternative": None, "dry_run": bool(dry_run)}:
                 found = [self.choose_freely(choice, dry_run=dry_run)]
             case {"choose": choice, "alternative": alternative, "by": str(by), "dry_run": bool(dry_run)}:
@@ -198,8 +223,8 @@ class Choices(Manager):
                 raise UsageError(f"{self.registrar.name}: expected a question to Choices, got {shown(message)}")
         return [msgspec.structs.asdict(info) for info in found]
 
-    def _info(self, id: str, held: Held) -> ChoiceInfo:
-        with self._changed:
+    def _info(self, id: str, held: HeldChoice) -> ChoiceInfo:
+        with self._lock:
             return self._by_hand.info(id, held, [one.key for one in self._allowed_now(id, held)])
 
     # -- the server ------------------------------------------------------------------------------------------------
@@ -208,7 +233,7 @@ class Choices(Manager):
     def load_choice(self, request: Choose) -> Chosen:
         """Load the best alternative that can be loaded."""
         best = self._offers.allowed(request)
-        search = self._search(Held(request, ""), retries=Retries())  # what is new waits for nothing
+        search = self._search(HeldChoice(request, ""), retries=Retries())  # what is new waits for nothing
 
         def take(one: Alternative, query: Query) -> Chosen:
             return self._addresses.made(search.id, search.held, one, query)
@@ -244,7 +269,7 @@ class Choices(Manager):
     def choice_status(self, request: Choose, status: Status) -> None:
         """Put the next best alternative in the place of one that has failed, or a better one that is well again."""
         id = current().resource_id
-        with self._changed:
+        with self._lock:
             held = self._held.get(id)
         try:
             if status.resource_id == id:
@@ -258,7 +283,7 @@ class Choices(Manager):
 
     # -- hearing ---------------------------------------------------------------------------------------------------
 
-    def _hear_part(self, id: str, held: Held | None, status: Status) -> None:
+    def _hear_part(self, id: str, held: HeldChoice | None, status: Status) -> None:
         part = part_of(self.registrar, status).part
         if part is None or held is None:
             status.handled()  # a run before a crash has dealt with it
@@ -269,7 +294,7 @@ class Choices(Manager):
         elif (one := self._in_use(held)) is not None:
             self._hear_response(id, held, one, part, status)
 
-    def _hear_response(self, id: str, held: Held, one: Alternative, part: Query, status: Status) -> None:
+    def _hear_response(self, id: str, held: HeldChoice, one: Alternative, part: Query, status: Status) -> None:
         """Pass on a new response of the part; if it has no address and needs one, replace the part."""
         try:
             chosen = self._addresses.made(id, held, one, part)
@@ -281,7 +306,7 @@ class Choices(Manager):
         self._addresses.point(id, chosen)
         status.handled()
 
-    def _hear_own(self, id: str, held: Held | None, status: Status) -> None:
+    def _hear_own(self, id: str, held: HeldChoice | None, status: Status) -> None:
         """Do what this manager has told a choice to do; other statuses of the choice are for its holders."""
         if status.state is State.FATAL:
             self._forget(id)
@@ -300,7 +325,7 @@ class Choices(Manager):
 
     # -- replacing -------------------------------------------------------------------------------------------------
 
-    def _return(self, id: str, held: Held, key: str, status: Status) -> None:
+    def _return(self, id: str, held: HeldChoice, key: str, status: Status) -> None:
         """Put a better alternative in the place of the one in use."""
         kind = held.request.kind
         try:
@@ -311,14 +336,15 @@ class Choices(Manager):
                 logger.info("%s: returns to %s", kind, key)
         except RrError as error:
             logger.warning("%s: cannot return to %s: %s", kind, key, error)
+            held.failures[key] = text_of(error)
             self._trials.failed(key, is_own=is_own_fault(error))
         finally:
             held.moving = False
             self._trials.look()
 
-    def _take_by_hand(self, id: str, held: Held, status: Status) -> None:
+    def _take_by_hand(self, id: str, held: HeldChoice, status: Status) -> None:
         """Put what was chosen by hand in the place of the one in use."""
-        with self._changed:
+        with self._lock:
             key = self._by_hand.key(id)
         one, present = self._offers.find(key, held.request.kind), self._in_use(held)
         parts = self.registrar.children(id)
@@ -330,16 +356,17 @@ class Choices(Manager):
         self._break(id, parts[0])
         self._choose_again(id, held, status)
 
-    def _replace(self, id: str, held: Held, status: Status, part: Query) -> None:
+    def _replace(self, id: str, held: HeldChoice, status: Status, part: Query) -> None:
         """Put the next best alternative in the place of one that has failed; give up if there is none."""
         failed, said = held.present, status.message or str(status.state)
-        with self._changed:
+        with self._lock:
             if failed == self._by_hand.key(id):
                 said += "; it was chosen by hand, and takes its place back when it is well"
         is_own = is_own_failure(status)
         if is_own and (one := self._in_use(held)) is not None:
             self._offers.lower(one, status.resource_id)
         self._trials.failed(failed, status.resource_id, is_own=is_own)
+        held.failures[failed] = said
         search = self._search(held, part, [f"{failed}: {said}"])
         if self._fill(search, status, {failed}):
             logger.warning("%s: %s takes the place of %s: %s", held.request.kind, held.present, failed, said)
@@ -350,17 +377,21 @@ class Choices(Manager):
             logger.warning("%s", nothing_left(held.request, search.tried))
         self._trials.look()
 
-    def _choose_again(self, id: str, held: Held, status: Status) -> None:
+    def _choose_again(self, id: str, held: HeldChoice, status: Status) -> None:
         """Choose anew where one has been released; after a crash, the next one may have come as far as to be a part."""
         for part in self.registrar.children(id):
-            self._release(part)
+            release(part)
         search = self._search(held)
         if not self._fill(search, status, ()):
             self._give_up(search, status)
         self._trials.look()
 
     def _search(
-        self, held: Held, part: Query | None = None, tried: Sequence[str] = (), retries: Retries[str] | None = None
+        self,
+        held: HeldChoice,
+        part: Query | None = None,
+        tried: Sequence[str] = (),
+        retries: Retries[str] | None = None,
     ) -> ChoiceSearch:
         return ChoiceSearch(self.registrar, retries or self._trials.retries, held, part, tried)
 
@@ -368,7 +399,7 @@ class Choices(Manager):
         """Put the first alternative that can be had in the place of the part. Return whether there was one."""
 
         def one_pass() -> bool | None:
-            with self._changed:  # else what fails meanwhile is tried once more
+            with self._lock:  # else what fails meanwhile is tried once more
                 search.decided_at = time.monotonic()
                 allowed = self._allowed_now(search.id, search.held)
                 fixed = {one.key for one in allowed[:1]} & {self._by_hand.key(search.id)}
@@ -399,7 +430,7 @@ class Choices(Manager):
         self,
         search: ChoiceSearch,
         group: Sequence[Alternative],
-        begin: Callable[[Loading], Reply[Query]],
+        begin: Callable[[CandidateLoad], Reply[Query]],
         take: Callable[[Alternative, Query], Chosen],
         failed: Callable[[Alternative, Exception], None],
         check: Callable[[], object] = lambda: None,
@@ -415,7 +446,7 @@ class Choices(Manager):
 
         return search.first(group, lambda one: begin(loading_of(one)), use, failed, check=check, hedge_s=hedge_s)
 
-    def _load_part(self, load: Loading) -> Reply[Query]:
+    def _load_part(self, load: CandidateLoad) -> Reply[Query]:
         """Load the part of a choice that has none, and wait for it: a load that a crash left would be one too many."""
         loaded: Reply[Query] = Reply()
         loaded.set(self.registrar.load(load.server, load.request, timeout_s=load.timeout_s))
@@ -441,7 +472,7 @@ class Choices(Manager):
     def _use(self, search: ChoiceSearch, chosen: Chosen) -> None:
         """Note that a choice has this part now."""
         self._addresses.point(search.id, chosen)
-        with self._changed:
+        with self._lock:
             self._held[search.id] = search.held
 
     def _give_up(self, search: ChoiceSearch, status: Status) -> None:
@@ -453,25 +484,19 @@ class Choices(Manager):
 
     def _break(self, id: str, part: Query) -> None:
         """Release the part. It is on disk before that the choice has none, and so a crash does not leave it so."""
-        with self._changed:
+        with self._lock:
             self._record.now.choices.append(id)
             self._record.save()
         self._addresses.point(id, None)
-        self._release(part)
+        release(part)
 
     def _mend(self, id: str) -> None:
-        with self._changed:
+        with self._lock:
             if id in self._record.now.choices:
                 self._record.now.choices = [other for other in self._record.now.choices if other != id]
                 self._record.save()
 
-    def _release(self, part: Query) -> None:
-        try:
-            part.unload_if_held()
-        except RrError as error:
-            logger.warning("%s cannot be released: %s", part.server_id, error)
-
-    def _restore_relays(self, held: Mapping[str, Held]) -> None:
+    def _restore_relays(self, held: Mapping[str, HeldChoice]) -> None:
         """Open the relays at the addresses that programs know; a choice is lost if that is not possible."""
         for info in self.registrar.resources():
             if info.id in held and info.response.address:
@@ -493,7 +518,7 @@ class Choices(Manager):
         except (msgspec.ValidationError, ConfigError, LoadFailed):
             return []
 
-    def _allowed_now(self, id: str, held: Held) -> list[Alternative]:
+    def _allowed_now(self, id: str, held: HeldChoice) -> list[Alternative]:
         """Return what a choice allows now, the best first, and what was chosen by hand before all. With the lock."""
         by_hand = self._by_hand.key(id)
         return sorted(self._offers.allowed_now(held.request), key=lambda one: one.key != by_hand)
@@ -508,45 +533,45 @@ class Choices(Manager):
     def _not_loaded(self, search: ChoiceSearch, one: Alternative, error: Exception) -> None:
         """Note that an alternative cannot be loaded. Only a fault of its own lowers its reliability, and once."""
         is_own = is_own_fault(error)
+        search.held.failures[one.key] = text_of(error)
         counts = self._trials.failed(one.key, began=search.decided_at, is_own=is_own)
         if is_own and counts:
             self._offers.lower(one, new_id())
 
-    def _in_use(self, held: Held) -> Alternative | None:
+    def _in_use(self, held: HeldChoice) -> Alternative | None:
         """Return the alternative that a choice has; None if neither the file nor a server names it any more."""
         return self._offers.find(held.present, held.request.kind)
 
     # -- for the trials --------------------------------------------------------------------------------------------
 
-    def _choices(self) -> dict[str, Choice]:
+    def _choices(self) -> dict[str, ChoiceState]:
         return {id: self._choice(id, held) for id, held in self._held.items()}
 
-    def _choice(self, id: str, held: Held) -> Choice:
+    def _choice(self, id: str, held: HeldChoice) -> ChoiceState:
         allowed = self._allowed_now(id, held)
         present = self._in_use(held)
         breaks = present is not None and present.break_first
         fixed = frozenset(one.key for one in allowed if breaks or one.break_first)
-        return Choice(tuple(one.key for one in allowed), held.present, fixed, held.failing)
+        return ChoiceState(tuple(one.key for one in allowed), held.present, fixed, held.failing)
 
-    def _load_on_trial(self, key: str, on_status: StatusCallback) -> Query:
-        """Load an alternative as the least urgent load there is: it takes room that is free, and nobody else's."""
+    def _load_on_trial(self, key: str, on_status: StatusCallback) -> Reply[Query]:
+        """Begin to load an alternative, as the least urgent load there is: it takes only room that is free."""
         one = self._offers.find(key)
         if one is None:
             raise UnknownServer(f"{key}: its server is not there any more", server=key, known=())
         server, request, limit_s = loading_of(one)
-        trial = begin_planned(self.registrar, server, request, on_status=on_status, priority=LOWEST, timeout_s=limit_s)
-        return trial.get()
+        return begin_planned(self.registrar, server, request, on_status=on_status, priority=LOWEST, timeout_s=limit_s)
 
     def _have_taken(self, id: str, key: str) -> None:
         """Have a choice return to an alternative, in its status callback, where a crash can repeat it."""
-        with self._changed:
+        with self._lock:
             held = self._held.get(id)
             if held is None or held.moving:
                 return
             held.moving = True
         self._tell(id, held, _TAKE + key)
 
-    def _tell(self, id: str, held: Held, what: str) -> None:
+    def _tell(self, id: str, held: HeldChoice, what: str) -> None:
         """Tell a choice of this manager what to do, in its status callback."""
         held.moving = True
         try:
@@ -559,7 +584,7 @@ class Choices(Manager):
 
     def _forget(self, id: str) -> None:
         self._addresses.close(id)
-        with self._changed:
+        with self._lock:
             self._held.pop(id, None)
             self._mend(id)
             self._by_hand.keep_only(self._held)
@@ -567,7 +592,7 @@ class Choices(Manager):
             self._trials.look()
 
     @functools.cached_property
-    def _held(self) -> dict[str, Held]:
+    def _held(self) -> dict[str, HeldChoice]:
         """The choices by resource id; at first those of the catalog. With the lock."""
         return {
             info.id: held_choice(info.request, info.response, self.registrar.children(info.id))

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from rr_actors.managers.choices.alternatives import Alternative
-from rr_actors.managers.choices.chosen import Held
+from rr_actors.managers.choices.chosen import HeldChoice
 from rr_actors.managers.planning.retries import Retries
-from rr_actors.managers.planning.searches import Loading, Search
+from rr_actors.managers.planning.searches import CandidateLoad, Search
 from rr_actors.registrar.queries import Query
 from rr_actors.registrar.registrar import NO_FIELDS, Registrar
 
@@ -16,16 +16,16 @@ class ChoiceSearch(Search[Alternative]):
     """A search for what a choice is to have in the place of `part`; None: it has no part."""
 
     def __init__(
-        self, registrar: Registrar, retries: Retries[str], held: Held, part: Query | None, tried: Sequence[str]
+        self, registrar: Registrar, retries: Retries[str], held: HeldChoice, part: Query | None, tried: Sequence[str]
     ) -> None:
         super().__init__(registrar, retries, _key, _key, lambda what: "; ".join((*self.tried, what)))
         self.held, self.part = held, part
         self.tried += tried
 
 
-def loading_of(one: Alternative) -> Loading:
+def loading_of(one: Alternative) -> CandidateLoad:
     """Return the load that gives an alternative."""
-    return Loading(one.server, NO_FIELDS if one.request is None else one.request, one.timeout_s)
+    return CandidateLoad(one.server, NO_FIELDS if one.request is None else one.request, one.timeout_s)
 
 
 def _key(one: Alternative) -> str:

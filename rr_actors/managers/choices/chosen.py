@@ -32,6 +32,12 @@ class Choose(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     prefer: list[str] = []
     bind: Literal["", "relay"] = ""
 
+    def __rr_title__(self) -> str:
+        where = ", ".join(f"{name} {wanted}" for name, wanted in self.where.items())
+        best = f"best {', '.join(self.prefer)}" if self.prefer else ""
+        said = "; ".join(filter(None, (where, best, self.bind)))
+        return f"{self.kind} ({said})" if said else self.kind
+
 
 class Chosen(msgspec.Struct, frozen=True):
     """The response: the alternative in use, what it provides, and its own response, as plain values.
@@ -50,12 +56,13 @@ class Chosen(msgspec.Struct, frozen=True):
     address: str = ""
 
 
-class Held(msgspec.Struct):
+class HeldChoice(msgspec.Struct):
     """A choice that is loaded.
 
     Attributes:
         failing: its part has said ERROR, and nothing could take its place.
         moving: it has been told to return to a better alternative, and has not done so.
+        failures: how each alternative failed last for this choice, since this process began.
     """
 
     request: Choose
@@ -63,12 +70,13 @@ class Held(msgspec.Struct):
     address: str = ""
     failing: bool = False
     moving: bool = False
+    failures: dict[str, str] = {}
 
 
-def held_choice(request: Choose, chosen: Chosen, parts: Sequence[Query]) -> Held:
+def held_choice(request: Choose, chosen: Chosen, parts: Sequence[Query]) -> HeldChoice:
     """Return what is known of a choice that a process before has made."""
     failing = any(part.state is State.ERROR for part in parts)
-    return Held(request, key_of(chosen.server, chosen.request), chosen.address, failing)
+    return HeldChoice(request, key_of(chosen.server, chosen.request), chosen.address, failing)
 
 
 def chosen_of(one: Alternative, query: Query) -> Chosen:

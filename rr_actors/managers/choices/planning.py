@@ -38,7 +38,7 @@ class Standing(msgspec.Struct, frozen=True):
 UNKNOWN = Standing()
 
 
-class Choice(msgspec.Struct, frozen=True):
+class ChoiceState(msgspec.Struct, frozen=True):
     """One choice: what it allows, the best first, and what it has.
 
     Attributes:
@@ -98,7 +98,7 @@ def in_turn(
     return sorted(others, key=lambda key: (key not in loaded, standings.get(key, UNKNOWN).retry_at > now))
 
 
-def plan(choices: Mapping[str, Choice], standings: Mapping[str, Standing], now: float, settle_s: float) -> Plan:
+def plan(choices: Mapping[str, ChoiceState], standings: Mapping[str, Standing], now: float, settle_s: float) -> Plan:
     """Say what to do for all choices together: one trial serves each choice for which it would be better."""
     better = {id: choice.better() for id, choice in choices.items()}
     wanted = list(dict.fromkeys(key for keys in better.values() for key in keys))

@@ -45,7 +45,7 @@ _RETRY_LIMIT_S = 1.0
 _FULL = 65_536  # a transport with so many bytes to write is full
 
 
-class Address(msgspec.Struct, frozen=True):
+class SocketAddress(msgspec.Struct, frozen=True):
     """The address of a socket of this machine, or of a host that was allowed. `port` is 0 for a Unix socket."""
 
     place: str
@@ -57,7 +57,7 @@ class Address(msgspec.Struct, frozen=True):
         return f"tcp:[{self.place}]:{self.port}" if ":" in self.place else f"tcp:{self.place}:{self.port}"
 
 
-def parse_address(text: object, hosts: Collection[str] = ()) -> Address:
+def parse_address(text: object, hosts: Collection[str] = ()) -> SocketAddress:
     """Read an address.
 
     Args:
@@ -70,14 +70,14 @@ def parse_address(text: object, hosts: Collection[str] = ()) -> Address:
     if kind == "unix" and rest.startswith("/") and "\0" not in rest:
         if len(os.fsencode(rest)) > _PATH_BYTES:
             raise _wrong(f"a path of at most {_PATH_BYTES} bytes", text)
-        return Address(rest)
+        return SocketAddress(rest)
     host, _, port = rest.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
     if kind != "tcp" or not host or not (port.isascii() and port.isdigit()) or not 0 < int(port) < 65_536:
         raise _wrong(_EXPECTED, text)
     if host not in hosts and not _is_here(host):
         raise _wrong("an address of this machine, or of one of relay_hosts", text)
-    return Address(host, int(port))
+    return SocketAddress(host, int(port))
 
 
 def _is_here(host: str) -> bool:
@@ -104,7 +104,7 @@ class Relays:
         self._thread: threading.Thread | None = None
         self._ending: asyncio.Future[None] | None = None
 
-    def open(self, id: str, address: Address) -> Address:
+    def open(self, id: str, address: SocketAddress) -> SocketAddress:
         """Open a relay if it is not open, and return its address.
 
         Args:
@@ -131,7 +131,7 @@ class Relays:
             self._relays[id] = relay
             return relay.address
 
-    def point(self, id: str, source: Address | None) -> None:
+    def point(self, id: str, source: SocketAddress | None) -> None:
         """Have a relay pass on the bytes of another source, or, with None, of nothing for now."""
         with self._lock:
             relay = self._relays.get(id)
@@ -169,7 +169,7 @@ class Relays:
         return self._ending
 
 
-def _listening(address: Address) -> socket.socket:
+def _listening(address: SocketAddress) -> socket.socket:
     """Return a socket that listens there. What a process that was killed has left at a path is removed."""
     is_tcp = not address.place.startswith("/")
     listener = socket.socket(socket.AF_INET if is_tcp else socket.AF_UNIX, socket.SOCK_STREAM)
@@ -197,9 +197,9 @@ class _Relay:
 
     def __init__(self, loop: asyncio.AbstractEventLoop, listener: socket.socket) -> None:
         name = listener.getsockname()
-        self.address = Address(name) if isinstance(name, str) else Address(name[0], name[1])
+        self.address = SocketAddress(name) if isinstance(name, str) else SocketAddress(name[0], name[1])
         self.loop = loop
-        self.source: Address | None = None
+        self.source: SocketAddress | None = None
         self._open: set[_Program | _Source] = set()
         self._is_empty = asyncio.Event()
         self._is_empty.set()
@@ -215,7 +215,7 @@ class _Relay:
     def _accepted(self) -> _Program:
         return _Program(self)
 
-    def point(self, source: Address | None) -> None:
+    def point(self, source: SocketAddress | None) -> None:
         if source != self.source:
             self.source = source
             for program in self.programs():
@@ -329,7 +329,7 @@ class _Program(asyncio.Protocol):
         if self._relay.source is not None:
             self._connecting = self._relay.loop.create_task(self._connected(self._relay.source, after_s))
 
-    async def _connected(self, address: Address, after_s: float) -> None:
+    async def _connected(self, address: SocketAddress, after_s: float) -> None:
         await asyncio.sleep(after_s)
         while True:
             try:
@@ -341,7 +341,7 @@ class _Program(asyncio.Protocol):
             await asyncio.sleep(self._retry_s)
             self._retry_s = min(2 * self._retry_s, _RETRY_LIMIT_S)
 
-    async def _reach(self, address: Address) -> None:
+    async def _reach(self, address: SocketAddress) -> None:
         make = functools.partial(_Source, self._relay, self, asyncio.current_task())
         if address.port:
             await self._relay.loop.create_connection(make, address.place, address.port)

@@ -26,7 +26,7 @@ NO_READING = "no reading"
 _HINDERED = (NONE_REGISTERED, OVER_CAPACITY, FAILING, ALL_FAILING, UNLOAD_FAILED)
 
 
-class Wanted(msgspec.Struct, frozen=True):
+class WantedReplica(msgspec.Struct, frozen=True):
     """A replica that is wanted. `what`: the canonical bytes of its request, equal for equal things."""
 
     keep: str
@@ -41,7 +41,7 @@ class Wanted(msgspec.Struct, frozen=True):
         return self.keep, self.instance
 
 
-class Seen(msgspec.Struct, frozen=True):
+class SeenReplica(msgspec.Struct, frozen=True):
     """A replica that is there.
 
     Attributes:
@@ -76,7 +76,7 @@ class Seen(msgspec.Struct, frozen=True):
         return self.phase == "held" and self.state not in (State.ERROR, State.FATAL)
 
 
-class Steps(msgspec.Struct):
+class ReplicaSteps(msgspec.Struct):
     """What to do.
 
     Attributes:
@@ -87,14 +87,14 @@ class Steps(msgspec.Struct):
         next_at: when there will be more to do if nothing happens; None: never.
     """
 
-    load: list[Wanted] = []
-    withdraw: list[Seen] = []
-    release: list[Seen] = []
-    prioritise: list[tuple[Seen, int | None]] = []
+    load: list[WantedReplica] = []
+    withdraw: list[SeenReplica] = []
+    release: list[SeenReplica] = []
+    prioritise: list[tuple[SeenReplica, int | None]] = []
     next_at: float | None = None
 
 
-class Report(msgspec.Struct, frozen=True):
+class KeptReport(msgspec.Struct, frozen=True):
     """How one kind of thing is: how many replicas are wanted and ready, and why others are not.
 
     `why` is "" if all are ready; `detail` is the text of the first failure. `is_hindered`: a failure is the reason, and
@@ -113,12 +113,14 @@ class Report(msgspec.Struct, frozen=True):
     scaled: str = ""
 
 
-def compare(wanted: Sequence[Wanted], seen: Iterable[Seen], failures: Mapping[Slot, Setback], now: float) -> Steps:
+def compare(
+    wanted: Sequence[WantedReplica], seen: Iterable[SeenReplica], failures: Mapping[Slot, Setback], now: float
+) -> ReplicaSteps:
     """Return the steps from what is seen to what is wanted.
 
     A slot is loaded only when nothing else is left in it, so there is never a second one of a replica.
     """
-    steps, due = Steps(), list[float]()
+    steps, due = ReplicaSteps(), list[float]()
     there = _by_slot(seen)
     waiting = unready(wanted, there)
     for one in wanted:
@@ -140,16 +142,16 @@ def compare(wanted: Sequence[Wanted], seen: Iterable[Seen], failures: Mapping[Sl
     return steps
 
 
-def unready(wanted: Iterable[Wanted], there: Mapping[Slot, Sequence[Seen]]) -> set[str]:
+def unready(wanted: Iterable[WantedReplica], there: Mapping[Slot, Sequence[SeenReplica]]) -> set[str]:
     """Return the names of what is wanted and not ready in all its replicas."""
     return {one.keep for one in wanted if not _is_ready(one, there.get(one.slot, ()))}
 
 
 def report(
-    names: Iterable[str], wanted: Iterable[Wanted], seen: Iterable[Seen], failures: Mapping[Slot, Setback]
-) -> dict[str, Report]:
+    names: Iterable[str], wanted: Iterable[WantedReplica], seen: Iterable[SeenReplica], failures: Mapping[Slot, Setback]
+) -> dict[str, KeptReport]:
     """Return how each of the names is."""
-    of_name: dict[str, list[Wanted]] = {name: [] for name in names}
+    of_name: dict[str, list[WantedReplica]] = {name: [] for name in names}
     for one in wanted:
         of_name[one.keep].append(one)
     there = _by_slot(seen)
@@ -159,11 +161,11 @@ def report(
 
 def _report(
     name: str,
-    wanted: Sequence[Wanted],
-    there: Mapping[Slot, Sequence[Seen]],
+    wanted: Sequence[WantedReplica],
+    there: Mapping[Slot, Sequence[SeenReplica]],
     failures: Mapping[Slot, Setback],
     waiting: set[str],
-) -> Report:
+) -> KeptReport:
     missing = [one for one in wanted if not _is_ready(one, there.get(one.slot, ()))]
     reasons = [_reason(one, there.get(one.slot, ()), failures.get(one.slot), waiting) for one in missing]
     whys = list(dict.fromkeys(why for why, _ in reasons))
@@ -171,10 +173,12 @@ def _report(
         whys = [ALL_FAILING]
     detail = next((text for why, text in reasons if why in _HINDERED and text), "")
     is_hindered = any(why in _HINDERED for why in whys)
-    return Report(name, len(wanted), len(wanted) - len(missing), ", ".join(whys), detail, is_hindered)
+    return KeptReport(name, len(wanted), len(wanted) - len(missing), ", ".join(whys), detail, is_hindered)
 
 
-def _reason(one: Wanted, found: Sequence[Seen], failed: Setback | None, waiting: set[str]) -> tuple[str, str]:
+def _reason(
+    one: WantedReplica, found: Sequence[SeenReplica], failed: Setback | None, waiting: set[str]
+) -> tuple[str, str]:
     """Return why a replica is not ready, and the text of the failure."""
     right = _right(one, found)
     if right is None and (stuck := next((other.stuck for other in found if other.stuck), "")):
@@ -188,14 +192,14 @@ def _reason(one: Wanted, found: Sequence[Seen], failed: Setback | None, waiting:
     return failed.reason, failed.text
 
 
-def _by_slot(seen: Iterable[Seen]) -> dict[Slot, list[Seen]]:
-    there: dict[Slot, list[Seen]] = {}
+def _by_slot(seen: Iterable[SeenReplica]) -> dict[Slot, list[SeenReplica]]:
+    there: dict[Slot, list[SeenReplica]] = {}
     for one in seen:
         there.setdefault(one.slot, []).append(one)
     return there
 
 
-def _right(one: Wanted, found: Iterable[Seen]) -> Seen | None:
+def _right(one: WantedReplica, found: Iterable[SeenReplica]) -> SeenReplica | None:
     """Return what is there for a replica that is wanted, and is to stay."""
     for other in found:
         if other.what == one.what and other.phase in ("loading", "held") and other.state is not State.FATAL:
@@ -203,17 +207,17 @@ def _right(one: Wanted, found: Iterable[Seen]) -> Seen | None:
     return None
 
 
-def _is_ready(one: Wanted, found: Iterable[Seen]) -> bool:
+def _is_ready(one: WantedReplica, found: Iterable[SeenReplica]) -> bool:
     right = _right(one, found)
     return right is not None and right.is_ready
 
 
-def _is_in_the_way(other: Seen, one: Wanted) -> bool:
+def _is_in_the_way(other: SeenReplica, one: WantedReplica) -> bool:
     """Return whether a replica cannot be loaded yet: a load of what is ending is answered after its end by itself."""
     return other.phase != "ending" or other.what != one.what
 
 
-def _give_up(found: Iterable[Seen], steps: Steps, due: list[float], now: float) -> None:
+def _give_up(found: Iterable[SeenReplica], steps: ReplicaSteps, due: list[float], now: float) -> None:
     for one in found:
         if one.phase == "loading":
             steps.withdraw.append(one)

@@ -43,7 +43,7 @@ from rr_actors.base.names import parse_server_id
 from rr_actors.base.toml import parse_typed, raise_faults, wrong
 from rr_actors.base.values.canonical import encode
 from rr_actors.managers.keeper import scaling
-from rr_actors.managers.keeper.comparing import Wanted
+from rr_actors.managers.keeper.comparing import WantedReplica
 from rr_actors.managers.keeper.scaling import Range, ScaleOn
 from rr_actors.managers.planning.probes import NoProbe, probe_of
 from rr_actors.registrar.model.rows import HIGHEST, LOWEST
@@ -55,7 +55,7 @@ Request = Any
 """A request of any server: plain data, as TOML has it. None: the server's request with all of its defaults."""
 
 
-class Keep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class KeptKind(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One kind of thing that is kept.
 
     Attributes:
@@ -101,7 +101,7 @@ class Member(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     request: Request = None
 
 
-class Group(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class KeptGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Resources that are loaded together, by their name at `keeper/group`."""
 
     name: str
@@ -111,8 +111,8 @@ class Group(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class KeepFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The whole file."""
 
-    keep: tuple[Keep, ...] = ()
-    group: tuple[Group, ...] = ()
+    keep: tuple[KeptKind, ...] = ()
+    group: tuple[KeptGroup, ...] = ()
 
 
 class Replica(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -128,28 +128,31 @@ class Replica(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     request: Request = None
     members: tuple[Member, ...] = ()
 
+    def __rr_title__(self) -> str:
+        return f"{self.keep} {self.instance}"
+
 
 class Desired(msgspec.Struct, frozen=True):
     """What is to be kept, and the groups, by their names."""
 
-    keeps: dict[str, Keep] = {}
-    groups: dict[str, Group] = {}
+    keeps: dict[str, KeptKind] = {}
+    groups: dict[str, KeptGroup] = {}
 
-    def replicas(self, group_server: str, counts: Mapping[str, int] = NO_COUNTS) -> list[tuple[Wanted, Replica]]:
+    def replicas(self, group_server: str, counts: Mapping[str, int] = NO_COUNTS) -> list[tuple[WantedReplica, Replica]]:
         """Return all replicas that are wanted.
 
         Args:
             group_server: the id of the server of groups.
             counts: how many are wanted of what scales, by its name. Without, the least.
         """
-        found: list[tuple[Wanted, Replica]] = []
+        found: list[tuple[WantedReplica, Replica]] = []
         for keep in self.keeps.values():
             priority = None if keep.standby else keep.priority
             for i in range(counts.get(keep.name, keep.least)):
                 request = numbered(keep.request, i)
                 members = self.members(request, group_server) if keep.server == group_server else ()
                 replica = Replica(keep.name, i, keep.server, request, members)
-                found.append((Wanted(keep.name, i, encode(replica), priority, keep.after), replica))
+                found.append((WantedReplica(keep.name, i, encode(replica), priority, keep.after), replica))
         return found
 
     def members(self, group: Request, group_server: str) -> tuple[Member, ...]:
@@ -212,7 +215,7 @@ class _Checks:
                 self._wrong(f"{table}[{i}].name", f"a name that no other {table} has", name, said)
             seen.add(name)
 
-    def keep(self, key: str, keep: Keep) -> None:
+    def keep(self, key: str, keep: KeptKind) -> None:
         most = keep.replicas if keep.max is None else keep.max
         replicas = min(max(most, 1), MOST_REPLICAS)
         self.loads(key, keep.server, [numbered(keep.request, i) for i in range(replicas)])
@@ -229,7 +232,7 @@ class _Checks:
                 said = f"{shown(name)}{did_you_mean(name, self._keeps)}"
                 self._wrong(f"{key}.after[{i}]", f"one of {few(self._keeps)}", name, said)
 
-    def _scale(self, key: str, keep: Keep) -> None:
+    def _scale(self, key: str, keep: KeptKind) -> None:
         """Check what decides how many replicas there are."""
         on = keep.scale_on
         if on is None:
@@ -265,7 +268,7 @@ class _Checks:
             said = f"{shown(name)}{did_you_mean(name, self._groups) if isinstance(name, str) else ''}"
             self._wrong(f"{key}.request", f"the name of a group: {few(self._groups) or 'none'}", name, said)
 
-    def inner(self, group: Group) -> tuple[str, ...]:
+    def inner(self, group: KeptGroup) -> tuple[str, ...]:
         """Return the names of the groups that are members of one."""
         names = (member.request for member in group.member if member.server == self._group_server)
         return tuple(name for name in names if isinstance(name, str))

@@ -16,6 +16,7 @@ from typing import Any
 
 import msgspec
 
+from rr_actors.actors.actor_tables import TableColumn, table
 from rr_actors.base.errors import (
     CatalogError,
     NotFound,
@@ -35,12 +36,12 @@ from rr_actors.base.errors import (
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.canonical import encode
 from rr_actors.managers.keeper import comparing
-from rr_actors.managers.keeper.comparing import Report, Seen, Slot, Steps, Wanted
+from rr_actors.managers.keeper.comparing import KeptReport, ReplicaSteps, SeenReplica, Slot, WantedReplica
 from rr_actors.managers.keeper.desired import Desired, Replica, Request, changes, parse_desired
 from rr_actors.managers.keeper.scaler import KeptScales, Scaler
 from rr_actors.managers.planning.kept_record import KeptRecord
 from rr_actors.managers.planning.last_good import LastGood, Sources, one_file, path_of
-from rr_actors.managers.planning.planning_loop import Ended, PlanningLoop
+from rr_actors.managers.planning.planning_loop import PlanningLoop, StepEnded
 from rr_actors.managers.planning.setbacks import BACKOFF, Setbacks
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.manager import Manager
@@ -101,7 +102,7 @@ class Keeper(Manager):
         name = "keeper" if beginning is None else beginning.name
         self._group_server = f"{name}/group"
         self._configuration = LastGood(beginning, lambda: one_file(path), self._parse)
-        self._loop: PlanningLoop[Slot | str, Wanted | None] = PlanningLoop("keeper", self._look, self._failed)
+        self._loop: PlanningLoop[Slot | str, WantedReplica | None] = PlanningLoop("keeper", self._look, self._failed)
         record = None if beginning is None else KeptRecord(beginning.directory / "scales.json", KeptScales)
         self._scaler = Scaler(self._loop, record, self._parts_of, self._registrar_of)
         self._backoff = backoff
@@ -115,8 +116,8 @@ class Keeper(Manager):
         self._lost: set[str] = set()
         self._is_full = False  # something of the last look could not be written
         self._what: dict[str, bytes] = {}  # by query, as its replica does not change
-        self._wanted: tuple[Desired, dict[str, int], list[tuple[Wanted, Replica]]] | None = None
-        self._reports: dict[str, Report] | None = None
+        self._wanted: tuple[Desired, dict[str, int], list[tuple[WantedReplica, Replica]]] | None = None
+        self._reports: dict[str, KeptReport] | None = None
 
     def on_start(self) -> None:
         """Go on with what is held."""
@@ -162,6 +163,23 @@ class Keeper(Manager):
             return self._differences()
         return changes(self._desired, self._parse(one_file(path_of(file, "diff", "file"))))
 
+    @table(
+        "kept",
+        TableColumn("name", "kept"),
+        TableColumn("ready", kind="number", of="wanted"),
+        TableColumn("range"),
+        TableColumn("scaled", kind="long"),
+        TableColumn("why", kind="problem"),
+        TableColumn("detail", kind="problem"),
+    )
+    def kept_rows(self) -> list[dict[str, Any]]:
+        """Return how all that is kept is, with the detail of what is not ready."""
+        rows: list[dict[str, Any]] = []
+        for one in self._newest_reports().values():
+            range_ = "" if one.least is None else f"{one.least}-{one.most}"
+            rows.append(msgspec.structs.asdict(one) | {"range": range_})
+        return rows
+
     def on_receive(self, message: Any) -> Any:
         """Answer what `rr-actors apply` and `rr-actors keep` ask."""
         match message:
@@ -172,7 +190,7 @@ class Keeper(Manager):
             case {"diff": None}:
                 return self._differences()
             case {"get": None}:
-                return [msgspec.structs.asdict(report) for report in self._newest_reports().values()]
+                return self.kept_rows()
             case _:
                 raise UsageError(f"{self.registrar.name}: expected a question to a Keeper, got {shown(message)}")
 
@@ -264,16 +282,16 @@ class Keeper(Manager):
 
     # -- what is there ---------------------------------------------------------------------------------------------
 
-    def _seen(self, infos: list[ResourceInfo], now: float) -> Iterator[Seen]:
+    def _seen(self, infos: list[ResourceInfo], now: float) -> Iterator[SeenReplica]:
         """Yield the replicas that are being loaded, that are held, and that nobody holds any more.
 
         What a load in flight has made is a part of that load, also if the registrar lists it as held already.
         """
-        loading = dict[bytes, Wanted]()
+        loading = dict[bytes, WantedReplica]()
         for step in self._loop.in_flight.values():
             if (one := step.what) is not None:
                 loading[one.what] = one
-                yield Seen(one.keep, one.instance, one.what, "loading", is_slow=now - step.since >= _LOOK_S)
+                yield SeenReplica(one.keep, one.instance, one.what, "loading", is_slow=now - step.since >= _LOOK_S)
         by_id = {info.id: info for info in infos}
         held = set[str]()
         for query in self.registrar.queries():
@@ -284,16 +302,16 @@ class Keeper(Manager):
                     yield one
         for info in infos:
             if info.server == "replica" and info.id not in held and (what := encode(info.request)) not in loading:
-                yield Seen(info.request.keep, info.request.instance, what, "ending")
+                yield SeenReplica(info.request.keep, info.request.instance, what, "ending")
 
     def _is_own(self, query: Query) -> bool:
         return query.registrar == self.registrar.name and not query.parent
 
-    def _held(self, query: Query, info: ResourceInfo | None) -> Seen:
+    def _held(self, query: Query, info: ResourceInfo | None) -> SeenReplica:
         replica: Replica = query.request
         if query.id not in self._what:
             self._what[query.id] = encode(replica)
-        return Seen(
+        return SeenReplica(
             replica.keep,
             replica.instance,
             self._what[query.id],
@@ -306,7 +324,7 @@ class Keeper(Manager):
             self._stuck.get(query.id, ""),
         )
 
-    def _note_losses(self, seen: list[Seen], now: float) -> None:
+    def _note_losses(self, seen: list[SeenReplica], now: float) -> None:
         """Note each replica that has been lost, once, and forget what is not held any more."""
         held = {one.id for one in seen if one.id}
         for known in (self._held_since, self._messages, self._not_before, self._stuck, self._what):
@@ -323,7 +341,7 @@ class Keeper(Manager):
 
     # -- steps -----------------------------------------------------------------------------------------------------
 
-    def _carry_out(self, steps: Steps, requests: dict[Slot, Replica]) -> None:
+    def _carry_out(self, steps: ReplicaSteps, requests: dict[Slot, Replica]) -> None:
         for one in steps.withdraw:
             self._loop.withdraw(one.slot)
         for one in steps.release:
@@ -335,20 +353,20 @@ class Keeper(Manager):
         for one in steps.load:
             self._load(one, requests[one.slot])
 
-    def _load(self, one: Wanted, replica: Replica) -> None:
+    def _load(self, one: WantedReplica, replica: Replica) -> None:
         place = f"{self.registrar.name}/replica"
         begin = functools.partial(
             self.registrar.load, place, replica, priority=one.priority, timeout_s=None, block=False
         )
         self._loop.begin(one.slot, one, begin, functools.partial(self._loaded, one))
 
-    def _loaded(self, one: Wanted, ended: Ended) -> None:
+    def _loaded(self, one: WantedReplica, ended: StepEnded) -> None:
         if ended.error is not None:
             known = self._errors.get(one.slot) or ended.error
             logger.info("%s %d: %s", one.keep, one.instance, text_of(known))
             self._failures.note(one.slot, time.monotonic(), reason=_reason_of(known), text=text_of(known))
 
-    def _mark_lost(self, one: Seen) -> bool:
+    def _mark_lost(self, one: SeenReplica) -> bool:
         """Write that a replica is not to be used any more, before its parts go. Return whether that is on disk."""
         with self._unless_full():
             self._lost.add(one.id)
@@ -367,7 +385,7 @@ class Keeper(Manager):
     def _registrar_of(self, name: str) -> Registrar:
         return registrar_in(self._node, name, patient=False, owner=self)
 
-    def _release(self, one: Seen, parts: Sequence[str]) -> None:
+    def _release(self, one: SeenReplica, parts: Sequence[str]) -> None:
         """Release a replica after its parts. If one cannot be unloaded, it may be running still, and stays a part."""
         if parts:
             release = functools.partial(self.registrar.unload, parts[0], timeout_s=_PART_S, block=False)
@@ -376,13 +394,13 @@ class Keeper(Manager):
             release = functools.partial(self.registrar.unload, one.id, timeout_s=None, block=False)
             self._loop.begin(one.id, None, release, functools.partial(self._released, one))
 
-    def _part_released(self, one: Seen, parts: Sequence[str], ended: Ended) -> None:
+    def _part_released(self, one: SeenReplica, parts: Sequence[str], ended: StepEnded) -> None:
         if isinstance(ended.error, UnloadFailed):
             self._released(one, ended)
         else:  # a provider that does not run has it later: the release is owed
             self._release(one, parts)
 
-    def _released(self, one: Seen, ended: Ended) -> None:
+    def _released(self, one: SeenReplica, ended: StepEnded) -> None:
         if ended.error is not None and not isinstance(ended.error, UnknownQuery):
             logger.warning("%s %d cannot be released: %s", one.keep, one.instance, text_of(ended.error))
             self._not_before[one.id] = time.monotonic() + self._backoff.maximum_s
@@ -402,16 +420,16 @@ class Keeper(Manager):
         """Note a status of a replica. It is about the replica alone: the keeper's own resources do not hear it."""
         self._loop.tell(functools.partial(self._messages.__setitem__, status.query_id, status.message))
 
-    def _tell(self, infos: list[ResourceInfo], reports: dict[str, Report]) -> None:
+    def _tell(self, infos: list[ResourceInfo], reports: dict[str, KeptReport]) -> None:
         """Tell the holders of `kept` what has changed."""
         for info in infos:
             if info.server != "kept" or info.phase is not Phase.LOADED or info.status is State.FATAL:
                 continue
-            report = reports.get(info.request, Report(info.request, 0, 0, "not kept"))
+            report = reports.get(info.request, KeptReport(info.request, 0, 0, "not kept"))
             with self._unless_full(), contextlib.suppress(UsageError):  # it has just been unloaded
                 self._tell_one(info, report)
 
-    def _tell_one(self, info: ResourceInfo, report: Report) -> None:
+    def _tell_one(self, info: ResourceInfo, report: KeptReport) -> None:
         said, state = _said(report), _state_of(report)
         is_new = info.response != _kept(report)
         if is_new:
@@ -437,7 +455,7 @@ class Keeper(Manager):
                 elif info.message == _GROUP_CHANGED:
                     self.registrar.send_status(info, Status(State.OK, "the group is as it was loaded again"))
 
-    def _newest_reports(self) -> dict[str, Report]:
+    def _newest_reports(self) -> dict[str, KeptReport]:
         """Return the reports of the last look, or, before the first, of nothing."""
         if self._reports is not None:
             return self._reports
@@ -458,16 +476,16 @@ def _reason_of(error: BaseException) -> str:
     return comparing.OVER_CAPACITY if isinstance(error, OverCapacity) else comparing.FAILING
 
 
-def _kept(report: Report) -> Kept:
+def _kept(report: KeptReport) -> Kept:
     return Kept(report.name, report.wanted, report.ready, report.why, report.least, report.most, report.scaled)
 
 
-def _said(report: Report) -> str:
+def _said(report: KeptReport) -> str:
     """Return a report as a text for people."""
     return ": ".join(filter(None, (f"{report.ready} of {report.wanted} ready", report.why, report.detail)))
 
 
-def _state_of(report: Report) -> State:
+def _state_of(report: KeptReport) -> State:
     if not report.why:
         return State.OK
     return State.ERROR if report.ready == 0 and report.is_hindered else State.WARNING

@@ -12,11 +12,11 @@ from rr_actors.base.checks import is_number
 from rr_actors.base.errors import RrError, did_you_mean, shown, text_of
 from rr_actors.base.reporting.log import Log
 from rr_actors.managers.keeper import comparing, scaling
-from rr_actors.managers.keeper.comparing import Report, Slot, Wanted
-from rr_actors.managers.keeper.desired import Keep
+from rr_actors.managers.keeper.comparing import KeptReport, Slot, WantedReplica
+from rr_actors.managers.keeper.desired import KeptKind
 from rr_actors.managers.keeper.scaling import Range, Reading, Scale, ScaleOn
 from rr_actors.managers.planning.kept_record import KeptRecord
-from rr_actors.managers.planning.planning_loop import Ended, PlanningLoop
+from rr_actors.managers.planning.planning_loop import PlanningLoop, StepEnded
 from rr_actors.managers.planning.probes import probe_of
 from rr_actors.registrar.queries import Query
 from rr_actors.registrar.registrar import Registrar
@@ -57,7 +57,7 @@ class Scaler:
 
     def __init__(
         self,
-        loop: PlanningLoop[Slot | str, Wanted | None],
+        loop: PlanningLoop[Slot | str, WantedReplica | None],
         record: KeptRecord[KeptScales] | None,
         parts_of: Callable[[str], list[Query]],
         registrar_of: RegistrarOf,
@@ -69,7 +69,7 @@ class Scaler:
         self._troubles: dict[str, str] = {}
         self._due_at: dict[str, float] = {}
 
-    def counts(self, keeps: Iterable[Keep], held: Mapping[str, int], now: float) -> dict[str, int]:
+    def counts(self, keeps: Iterable[KeptKind], held: Mapping[str, int], now: float) -> dict[str, int]:
         """Return how many replicas are wanted of what scales. `held`: how many of a name are held.
 
         What scales since now, or is not in the record, goes on with the number that is held.
@@ -113,7 +113,7 @@ class Scaler:
                 self._read(name, range_, ready.get(name, ()))
         return min(times, default=None)
 
-    def told(self, name: str, report: Report) -> Report:
+    def told(self, name: str, report: KeptReport) -> KeptReport:
         """Return the report of one kind of thing with what is known of its number."""
         range_, trouble = self._ranges.get(name), self._troubles.get(name, "")
         if range_ is None:
@@ -137,7 +137,7 @@ class Scaler:
             read = functools.partial(_probed, on, len(ready))
         self._loop.begin_call((name, _READING), None, read, functools.partial(self._heard, name, range_))
 
-    def _heard(self, name: str, range_: Range, ended: Ended) -> None:
+    def _heard(self, name: str, range_: Range, ended: StepEnded) -> None:
         if self._ranges.get(name) != range_:  # another file holds by now
             return
         if ended.error is not None:

@@ -16,7 +16,7 @@ import msgspec
 LEAST_TRUST = 1e-9  # what counts less counts as this: else all chains with one that is not trusted would be equal
 
 
-class Link(msgspec.Struct, frozen=True):
+class ChainComponent(msgspec.Struct, frozen=True):
     """A component as the planner sees it: what it takes and gives, and how far it is trusted now, from 0 to 1."""
 
     name: str
@@ -26,19 +26,19 @@ class Link(msgspec.Struct, frozen=True):
     trust: float = 1.0
 
 
-class Step(msgspec.Struct, frozen=True):
+class PipeStep(msgspec.Struct, frozen=True):
     """One segment of a pipe that a file describes: any component of the type that takes and gives at least this."""
 
     type: str
     inputs: frozenset[str] = frozenset()
     outputs: frozenset[str] = frozenset()
 
-    def allows(self, link: Link) -> bool:
+    def allows(self, link: ChainComponent) -> bool:
         """Return whether the component can be this segment."""
         return link.type == self.type and self.inputs <= link.inputs and self.outputs <= link.outputs
 
 
-Way = tuple[Step, ...]
+Way = tuple[PipeStep, ...]
 
 
 class Goal(msgspec.Struct, frozen=True):
@@ -47,7 +47,7 @@ class Goal(msgspec.Struct, frozen=True):
     of_type: str
     ways: tuple[Way, ...] = ()
 
-    def is_met_by(self, chain: Sequence[Link]) -> bool:
+    def is_met_by(self, chain: Sequence[ChainComponent]) -> bool:
         """Return whether the chain is one, and ends in what is asked for."""
         joined = all(_follows(one, after) for one, after in pairwise(chain))
         if not chain or chain[0].inputs or not joined:
@@ -55,7 +55,7 @@ class Goal(msgspec.Struct, frozen=True):
         return any(_goes(way, chain) for way in self.ways) if self.ways else self.of_type in chain[-1].outputs
 
 
-def best_chain(links: Sequence[Link], goal: Goal) -> tuple[Link, ...] | None:
+def best_chain(links: Sequence[ChainComponent], goal: Goal) -> tuple[ChainComponent, ...] | None:
     """Return the best chain that meets the goal; None if there is none.
 
     This is Dijkstra's search. A longer chain is never more reliable, so the first that is found is the best. For the
@@ -64,7 +64,9 @@ def best_chain(links: Sequence[Link], goal: Goal) -> tuple[Link, ...] | None:
     return _Search(links, goal).run()
 
 
-def substitutes(links: Iterable[Link], before: Sequence[Link], after: Sequence[Link], goal: Goal) -> list[Link]:
+def substitutes(
+    links: Iterable[ChainComponent], before: Sequence[ChainComponent], after: Sequence[ChainComponent], goal: Goal
+) -> list[ChainComponent]:
     """Return the components that can stand between two parts of a chain, the most reliable first.
 
     None that is in one of the parts: it may be a device that cannot run twice.
@@ -74,7 +76,7 @@ def substitutes(links: Iterable[Link], before: Sequence[Link], after: Sequence[L
     return sorted(found, key=lambda link: -link.trust)
 
 
-def why_none(links: Sequence[Link], goal: Goal) -> list[str]:
+def why_none(links: Sequence[ChainComponent], goal: Goal) -> list[str]:
     """Return, for a goal that no chain meets, what is missing for each way to it."""
     if goal.ways:
         return [_missing_on(way, links) for way in goal.ways]
@@ -82,7 +84,7 @@ def why_none(links: Sequence[Link], goal: Goal) -> list[str]:
     return [f"{one.name} takes {_listed(one.inputs)}: no chain of components gives that" for one in givers]
 
 
-def _missing_on(way: Way, links: Sequence[Link]) -> str:
+def _missing_on(way: Way, links: Sequence[ChainComponent]) -> str:
     for i, step in enumerate(way):
         if not any(step.allows(link) for link in links):
             needs = f"takes {_listed(step.inputs)} and gives {_listed(step.outputs)}"
@@ -94,11 +96,11 @@ def _listed(types: Iterable[str]) -> str:
     return ", ".join(sorted(types)) or "nothing"
 
 
-def _follows(one: Link, after: Link) -> bool:
+def _follows(one: ChainComponent, after: ChainComponent) -> bool:
     return bool(after.inputs) and after.inputs <= one.outputs
 
 
-def _goes(way: Way, chain: Sequence[Link]) -> bool:
+def _goes(way: Way, chain: Sequence[ChainComponent]) -> bool:
     return len(way) == len(chain) and all(step.allows(link) for step, link in zip(way, chain, strict=True))
 
 
@@ -107,7 +109,7 @@ _Found = tuple[Fraction, int, tuple[int, ...], int]
 
 
 class _Search:
-    def __init__(self, links: Sequence[Link], goal: Goal) -> None:
+    def __init__(self, links: Sequence[ChainComponent], goal: Goal) -> None:
         self._links, self._goal = links, goal
         # Fractions are exact: rounded products of different chains might be equal, and the order would be lost.
         self._weights = [Fraction(max(link.trust, LEAST_TRUST)) for link in links]
@@ -117,7 +119,7 @@ class _Search:
             if link.inputs:
                 self._takers.setdefault(min(link.inputs), []).append(i)
 
-    def run(self) -> tuple[Link, ...] | None:
+    def run(self) -> tuple[ChainComponent, ...] | None:
         queue = list(self._begun())
         heapq.heapify(queue)
         while queue:
@@ -144,7 +146,7 @@ class _Search:
                 reached.add(i)
                 yield cost * self._weights[i], length + 1, (*path, i), way
 
-    def _allows(self, way: int, place: int, link: Link) -> bool:
+    def _allows(self, way: int, place: int, link: ChainComponent) -> bool:
         ways = self._goal.ways
         return not ways or (place < len(ways[way]) and ways[way][place].allows(link))
 

@@ -46,7 +46,7 @@ import msgspec
 from rr_actors.base.errors import ConfigError
 from rr_actors.base.toml import parse_typed, wrong
 from rr_actors.managers.components import ComponentDescription, check_components
-from rr_actors.managers.pipes.chains import Link, Step, Way
+from rr_actors.managers.pipes.chains import ChainComponent, PipeStep, Way
 from rr_actors.managers.planning.last_good import last_good_file
 from rr_actors.registrar.manager import Beginning
 
@@ -61,9 +61,9 @@ class PipeComponent(ComponentDescription, frozen=True, forbid_unknown_fields=Tru
     inputs: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
 
-    def link(self, trust: float) -> Link:
+    def link(self, trust: float) -> ChainComponent:
         """Return the component as the planner sees it."""
-        return Link(self.name, self.type, frozenset(self.inputs), frozenset(self.outputs), trust)
+        return ChainComponent(self.name, self.type, frozenset(self.inputs), frozenset(self.outputs), trust)
 
 
 class SegmentDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -82,7 +82,7 @@ class PipeDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def way(self) -> Way:
         """Return the segments as the planner sees them."""
-        return tuple(Step(one.type, frozenset(one.inputs), frozenset(one.outputs)) for one in self.segment)
+        return tuple(PipeStep(one.type, frozenset(one.inputs), frozenset(one.outputs)) for one in self.segment)
 
 
 class PipeFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

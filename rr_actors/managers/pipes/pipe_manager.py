@@ -11,7 +11,7 @@ from collections.abc import Collection, Sequence
 
 import msgspec
 
-from rr_actors.base.errors import LoadFailed, RrError, UnknownQuery, did_you_mean, shown
+from rr_actors.base.errors import LoadFailed, UnknownQuery, did_you_mean, shown
 from rr_actors.base.names import new_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
@@ -21,15 +21,16 @@ from rr_actors.managers.components import (
     Component,
     ComponentDescription,
     Components,
+    ComponentStart,
     LoadComponent,
-    Start,
     component_of,
 )
-from rr_actors.managers.pipes.chains import Goal, Link, best_chain, substitutes, why_none
+from rr_actors.managers.pipes.chains import ChainComponent, Goal, best_chain, substitutes, why_none
 from rr_actors.managers.pipes.pipe_files import PipeDescription, read_pipe_file
 from rr_actors.managers.planning.blame import is_own_fault
+from rr_actors.managers.planning.searches import release
 from rr_actors.managers.programs import RunProgram
-from rr_actors.managers.templates import Parameters
+from rr_actors.managers.templates import Parameters, with_parameters
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.queries import Query, Status
 from rr_actors.registrar.servers.callback_context import current
@@ -49,6 +50,9 @@ class Pipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     of_type: str
     parameters: Parameters = {}
     instance: str = ""
+
+    def __rr_title__(self) -> str:
+        return with_parameters(self.of_type, self.parameters, self.instance)
 
 
 class BuiltPipe(msgspec.Struct, frozen=True):
@@ -103,14 +107,14 @@ class Pipes(Components):
         def fitting() -> list[ComponentDescription]:
             return [self._described[link.name] for link in self._fitting(request, segments, place)]
 
-        def start(one: ComponentDescription) -> Start:
+        def start(one: ComponentDescription) -> ComponentStart:
             program, parameters = self._segment(request, one.name, place)
 
             def made(spare: Query) -> BuiltPipe:
                 new = component_of(one, parameters, spare)
                 return self._built(request, [*segments[:place], new, *segments[place + 1 :]])
 
-            return Start(self._loading(program), made)
+            return ComponentStart(self._loading(program), made)
 
         failed = self._described.get(segments[place].name)
         self._replace_part(request.of_type, failed, status, part, fitting, start)
@@ -144,17 +148,14 @@ class Pipes(Components):
             raise NoPipe("\n".join([f"no pipe for {request.of_type!r} could be run:", *why]), wanted=wanted)
         raise NoPipe("\n".join([f"no pipe for {request.of_type!r} can be built:", *why_none(self._links(), goal)]))
 
-    def _keep_common(self, held: list[tuple[Query, Component]], chain: Sequence[Link]) -> None:
+    def _keep_common(self, held: list[tuple[Query, Component]], chain: Sequence[ChainComponent]) -> None:
         """Release what is held beyond the first segments that another chain has as well."""
         same = 0
         while same < len(held) and same < len(chain) and held[same][1].name == chain[same].name:
             same += 1
         while len(held) > same:
-            query, component = held.pop()
-            try:
-                query.unload_if_held()
-            except RrError as error:  # it stays a part, and is released with the pipe
-                logger.warning("%s cannot be released: %s", component.name, error)
+            query, _ = held.pop()
+            release(query)  # if it cannot be released, it stays a part, and is released with the pipe
 
     def _load_segment(self, request: Pipe, name: str, place: int) -> tuple[Query, Component]:
         program, parameters = self._segment(request, name, place)
@@ -176,7 +177,7 @@ class Pipes(Components):
 
     # -- replacing -------------------------------------------------------------------------------------------------
 
-    def _fitting(self, request: Pipe, segments: Sequence[Component], place: int) -> list[Link]:
+    def _fitting(self, request: Pipe, segments: Sequence[Component], place: int) -> list[ChainComponent]:
         links = {link.name: link for link in self._links()}
         others = [one.name for i, one in enumerate(segments) if i != place]
         if not links.keys() >= set(others):  # the registry has changed since the pipe was built
@@ -194,7 +195,7 @@ class Pipes(Components):
 
     # -- choosing --------------------------------------------------------------------------------------------------
 
-    def _links(self, without: Collection[str] = ()) -> list[Link]:
+    def _links(self, without: Collection[str] = ()) -> list[ChainComponent]:
         described = self._described.values()
         return [one.link(self.reliability(one)) for one in described if one.name not in without]
 

@@ -36,7 +36,7 @@ K = TypeVar("K")
 W = TypeVar("W")
 
 
-class Ended(msgspec.Struct, frozen=True):
+class StepEnded(msgspec.Struct, frozen=True):
     """How a step ended: with a `value`, or an `error`, or it was withdrawn."""
 
     value: Any = None
@@ -44,7 +44,7 @@ class Ended(msgspec.Struct, frozen=True):
     is_withdrawn: bool = False
 
 
-class Step(msgspec.Struct, Generic[W]):
+class StepInFlight(msgspec.Struct, Generic[W]):
     """A step in flight: what it is about, when it began by the monotonic clock, and the reply that ends it.
 
     `limit`: what is left of its time; None: it has no limit.
@@ -78,8 +78,8 @@ class PlanningLoop(Generic[K, W]):
         """
         self._name, self._look, self._fail = name, look, fail
         self._happened: queue.SimpleQueue[Callable[[], object] | None] = queue.SimpleQueue()
-        self._in_flight: dict[K, Step[W]] = {}
-        self.in_flight: Mapping[K, Step[W]] = MappingProxyType(self._in_flight)
+        self._in_flight: dict[K, StepInFlight[W]] = {}
+        self.in_flight: Mapping[K, StepInFlight[W]] = MappingProxyType(self._in_flight)
         self._waiting: list[Reply[None]] = []  # callers of look_and_wait() that the next look answers
         self._over = threading.Lock()
         self._is_over = False
@@ -120,7 +120,12 @@ class PlanningLoop(Generic[K, W]):
     # -- steps, on the thread --------------------------------------------------------------------------------------
 
     def begin(
-        self, key: K, what: W, start: Callable[[], Any], ended: Callable[[Ended], object], limit_s: float | None = None
+        self,
+        key: K,
+        what: W,
+        start: Callable[[], Any],
+        ended: Callable[[StepEnded], object],
+        limit_s: float | None = None,
     ) -> None:
         """Begin a step. It is in flight until `ended` is called on the thread, and then the loop looks.
 
@@ -138,7 +143,7 @@ class PlanningLoop(Generic[K, W]):
         try:
             reply: Reply[Any] = start()
         except RrError as error:
-            self._happened.put(functools.partial(self._end, key, ended, Ended(error=error)))
+            self._happened.put(functools.partial(self._end, key, ended, StepEnded(error=error)))
             return
         step.reply, step.limit = reply, None if limit_s is None else RunningLimit(limit_s)
 
@@ -147,7 +152,7 @@ class PlanningLoop(Generic[K, W]):
 
         reply.add_done_callback(done)
 
-    def begin_call(self, key: K, what: W, call: Callable[[], object], ended: Callable[[Ended], object]) -> None:
+    def begin_call(self, key: K, what: W, call: Callable[[], object], ended: Callable[[StepEnded], object]) -> None:
         """Begin a step that waits: `call` runs in a thread of its own. The rest is as for begin().
 
         An error of `call` that is no RrError is a defect: the manager fails with it.
@@ -156,9 +161,9 @@ class PlanningLoop(Generic[K, W]):
 
         def run() -> None:
             try:
-                outcome = Ended(call())
+                outcome = StepEnded(call())
             except RrError as error:
-                outcome = Ended(error=error)
+                outcome = StepEnded(error=error)
             except Exception as error:
                 self._happened.put(functools.partial(_raise, error))
                 return
@@ -173,13 +178,13 @@ class PlanningLoop(Generic[K, W]):
             step.is_withdrawn = True
             step.reply.cancel()
 
-    def _add(self, key: K, what: W) -> Step[W]:
+    def _add(self, key: K, what: W) -> StepInFlight[W]:
         if key in self._in_flight:
             raise RuntimeError(f"{self._name}: a step of {key!r} is in flight already")
-        step = self._in_flight[key] = Step(what, time.monotonic())
+        step = self._in_flight[key] = StepInFlight(what, time.monotonic())
         return step
 
-    def _end(self, key: K, ended: Callable[[Ended], object], outcome: Ended) -> None:
+    def _end(self, key: K, ended: Callable[[StepEnded], object], outcome: StepEnded) -> None:
         del self._in_flight[key]
         ended(outcome)
 
@@ -268,10 +273,10 @@ def _raise(error: Exception) -> None:
     raise error
 
 
-def _outcome(reply: Reply[Any]) -> Ended:
+def _outcome(reply: Reply[Any]) -> StepEnded:
     if reply.cancelled():
-        return Ended(is_withdrawn=True)
+        return StepEnded(is_withdrawn=True)
     error = reply.exception()
     if error is None:
-        return Ended(reply.result())
-    return Ended(error=error if isinstance(error, Exception) else RrError(text_of(error)))
+        return StepEnded(reply.result())
+    return StepEnded(error=error if isinstance(error, Exception) else RrError(text_of(error)))

@@ -39,7 +39,7 @@ T = TypeVar("T")
 _LOOK_S = 0.01  # between two looks at whether a registrar is closed
 
 
-class Loading(NamedTuple):
+class CandidateLoad(NamedTuple):
     """What is loaded for a candidate."""
 
     server: str
@@ -218,17 +218,17 @@ class Search(Generic[C]):
             self.check_wanted()
             time.sleep(_LOOK_S)
 
-    def as_part(self, load: Loading) -> Reply[Query]:
+    def as_part(self, load: CandidateLoad) -> Reply[Query]:
         """Begin to load a part of the resource whose callback runs."""
         reply = self._registrar.load(load.server, load.request, timeout_s=load.timeout_s, block=False)
         return cast("Reply[Query]", reply)
 
-    def beside(self, load: Loading) -> Reply[Query]:
+    def beside(self, load: CandidateLoad) -> Reply[Query]:
         """Begin to load as no part of anything, as urgently as the resource is needed."""
         priority = next((info.priority for info in self._registrar.resources() if info.id == self.id), None)
         return begin_planned(self._registrar, load.server, load.request, timeout_s=load.timeout_s, priority=priority)
 
-    def swap(self, status: Status, part: Query | None, load: Loading, response: Callable[[Query], R]) -> R:
+    def swap(self, status: Status, part: Query | None, load: CandidateLoad, response: Callable[[Query], R]) -> R:
         """Put what is loaded beside in the place of the part; return the new response."""
         spare = self._registrar.replace_part(
             status, load.request, load.server, part=part, response=response, timeout_s=load.timeout_s
@@ -256,16 +256,17 @@ def groups(in_turn: Sequence[C], is_alone: Callable[[C], bool]) -> Iterator[Sequ
         yield [one for _, one in group]
 
 
+def release(query: Query) -> None:
+    """Release a query, and wait for its provider. If that refuses, the log says so: its holder releases it later."""
+    try:
+        query.unload_if_held()
+    except RrError as error:
+        logger.info("%s cannot be released now: %s", query.server_id, error)
+
+
 def release_soon(query: Query) -> None:
-    """Release a query in a thread of its own: that may wait for its provider."""
-
-    def release() -> None:
-        try:
-            query.unload_if_held()
-        except RrError as error:
-            logger.info("%s cannot be released now: %s", query.server_id, error)
-
-    threading.Thread(target=release, name="release", daemon=True).start()
+    """Release a query as release() does, in a thread of its own."""
+    threading.Thread(target=release, args=(query,), name="release", daemon=True).start()
 
 
 def release_strays(registrar: Registrar, server: str, begun: str) -> None:
@@ -278,14 +279,14 @@ def release_strays(registrar: Registrar, server: str, begun: str) -> None:
     """
     provider = parse_server(server).registrar
 
-    def release() -> None:
+    def release_all() -> None:
         with contextlib.suppress(RrError):  # nothing is held there, or this process stops
             _agree(registrar, provider)
             for query in strays(registrar, begun):
                 if query.server_id == server:
                     query.unload_if_held()
 
-    threading.Thread(target=release, name="strays", daemon=True).start()
+    threading.Thread(target=release_all, name="strays", daemon=True).start()
 
 
 def _agree(registrar: Registrar, provider: str) -> None:

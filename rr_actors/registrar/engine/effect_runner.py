@@ -17,7 +17,7 @@ from rr_actors.registrar.model import effects as e
 from rr_actors.registrar.model.effects import Effect
 from rr_actors.registrar.model.roles import BEGUN
 from rr_actors.registrar.model.rows import OWED, is_revocation
-from rr_actors.registrar.servers.registered_servers import Servers
+from rr_actors.registrar.servers.registered_servers import RegisteredServers
 from rr_actors.runtime.thread_rules import any_thread, on_loop, with_lock
 from rr_actors.runtime.time_limits import RunningTimers
 
@@ -32,7 +32,9 @@ _CALLBACKS = frozenset((e.StartCallback, e.Hear))
 class EffectRunner:
     """Carries out the effects that decisions cause, for a registrar's actor."""
 
-    def __init__(self, registrar: RegistrarBase, consumers: Consumers, servers: Servers, links: ProviderLinks) -> None:
+    def __init__(
+        self, registrar: RegistrarBase, consumers: Consumers, servers: RegisteredServers, links: ProviderLinks
+    ) -> None:
         self._registrar = registrar
         self._consumers = consumers
         self._servers = servers
@@ -154,6 +156,7 @@ class EffectRunner:
     def _load_resolved(self, effect: e.LoadResolved) -> None:
         held = effect.held
         self._registrar.catalog.wait_limits.pop(held.id, None)
+        self._registrar.listeners.places.pop(held.id, None)
         if effect.failure is not None:
             self._forget(held.id)
         waiter = self._registrar.loads.pop(held.id, None)
@@ -211,6 +214,8 @@ class EffectRunner:
         if not (effect.kept or registrar.node.watched.level[0]):
             return
         facts: dict[str, Any] = {"request": text_of_value(resource.request), "detail": effect.detail}
+        if title := registrar.title_of(resource):
+            facts["title"] = title
         if effect.notice is not None:
             with registrar.lock:
                 holders = dict.fromkeys(q.origin for q in registrar.catalog.queries_of(resource.id) if not q.parent)
@@ -235,7 +240,7 @@ class EffectRunner:
 
     def _in_line(self, effect: e.InLine) -> None:
         if effect.text:
-            self._registrar.progress.report(effect.resource_id, 0.0, effect.text)
+            self._registrar.progress.place(effect.resource_id, effect.text, effect.holder, effect.since)
         else:
             self._registrar.progress.forget(effect.resource_id)
 

@@ -21,6 +21,7 @@ from rr_actors.base.errors import (
     Unavailable,
     UnknownQuery,
     UnknownRegistrar,
+    counted,
 )
 from rr_actors.base.names import CLIENTS, REGISTRAR, new_id
 from rr_actors.base.reporting.log import Log
@@ -287,7 +288,8 @@ class Node(ProcessNode):
             await asyncio.wait_for(self._release_everything(registrar), timeout_s)
         except TimeoutError:
             left = len(registrar.catalog.held), len(registrar.catalog.resources)
-            logger.warning("%s: closed with %d queries and %d resources left", name, *left)
+            queries, resources = counted(left[0], "query"), counted(left[1], "resource")
+            logger.warning("%s: closed with %s and %s left", name, queries, resources)
         if not registrar.closed:
             try:
                 registrar.end_closing()
@@ -406,7 +408,7 @@ class Node(ProcessNode):
             registrar.take_turns()
             if name not in registrar.catalog.by_origin:
                 told.add(registrar.name)
-        for provider in self.directory.registrars():
+        for provider in [*self.directory.registrars(), *self.directory.other_hosts_registrars()]:
             entry = self.find(provider)
             if provider in self.registrars or entry is None or entry.status is not Presence.UP:
                 continue

@@ -13,7 +13,7 @@ import contextlib
 import math
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from itertools import chain
 from typing import Protocol, cast
 
@@ -25,7 +25,7 @@ from rr_actors.hosting.process_node import ProcessNode
 from rr_actors.registrar.core.notices import parked_on
 from rr_actors.registrar.model.catalog import Catalog
 from rr_actors.registrar.model.messages import Load, Message, Progressed
-from rr_actors.registrar.model.rows import Phase
+from rr_actors.registrar.model.rows import Phase, Resource
 from rr_actors.runtime.thread_rules import any_thread, on_loop
 
 INTERVAL_S = 0.1
@@ -78,15 +78,17 @@ class _Reports:
     """The reports of one load.
 
     Attributes:
+        has: while the load waits in line, the registrar that has the resource, and since when.
         newest: the last report, for readers at any time.
         unsent: the last report, until it is sent.
         turn: has an entry while no turn of the loop is planned for these reports. The thread that takes the entry plans
             one.
     """
 
-    __slots__ = ("newest", "turn", "unsent")
+    __slots__ = ("has", "newest", "turn", "unsent")
 
     def __init__(self) -> None:
+        self.has: tuple[str, float | None] | None = None
         self.newest: tuple[float, str] = (0.0, "")
         self.unsent: deque[tuple[float, str]] = deque(maxlen=1)
         self.turn: deque[None] = deque((None,))
@@ -117,6 +119,8 @@ class Reporting(Protocol):
 
     def whole(self) -> Catalog: ...
 
+    def title_of(self, resource: Resource) -> str: ...
+
 
 @on_loop
 class ProgressReports:
@@ -137,6 +141,12 @@ class ProgressReports:
         reports.newest = (fraction, text)
         reports.unsent.append(reports.newest)
         self._want_turn(resource_id, reports)
+
+    def place(self, resource_id: str, text: str, holder: str, since: float | None) -> None:
+        """Have the place in line sent soon of a load that waits, with who has the resource, since when."""
+        reports = self.loads.get(resource_id) or self.loads.setdefault(resource_id, _Reports())
+        reports.has = holder, since
+        self.report(resource_id, 0.0, text)
 
     @any_thread
     def newest(self, resource_id: str) -> tuple[float, str] | None:
@@ -167,8 +177,16 @@ class ProgressReports:
             self._send(resource_id, reports)
 
     def forget(self, resource_id: str) -> None:
-        """Drop the reports of a load that waits in line no longer."""
+        """Drop the reports of a load that waits in line no longer, and send so to all that wait."""
         self.loads.pop(resource_id, None)
+        with self._registrar.lock:
+            catalog = self._registrar.whole()
+            resource, waiting = catalog.resources.get(resource_id), _waiting(catalog, resource_id)
+        if resource is not None:
+            for origin, query_ids in waiting.items():
+                over = Progressed(query_ids, resource_id, resource.server, 0.0, "", in_line=True)
+                self._registrar.consumers.hint(origin, over)
+            self._registrar.consumers.flush()
 
     @any_thread
     def forget_sent(self, resource_id: str) -> bool:
@@ -211,7 +229,7 @@ class ProgressReports:
             resource = catalog.resources.get(resource_id)
         reports = self.loads.get(resource_id)
         if resource is not None and reports is not None and not reports.unsent:  # an unsent one will go to all
-            registrar.consumers.hint(origin, Progressed([query_id], resource_id, resource.server, *reports.newest))
+            registrar.consumers.hint(origin, _progressed([query_id], resource, *reports.newest, reports.has))
             registrar.consumers.flush()
 
     def _send(self, resource_id: str, reports: _Reports) -> bool:
@@ -230,13 +248,23 @@ class ProgressReports:
             waiting = _waiting(catalog, resource_id)
             fraction, text = reports.unsent.pop()
         for origin, query_ids in waiting.items():
-            registrar.consumers.hint(origin, Progressed(query_ids, resource_id, resource.server, fraction, text))
+            registrar.consumers.hint(origin, _progressed(query_ids, resource, fraction, text, reports.has))
         registrar.consumers.flush()
         if registrar.node.watched:
             where = {"registrar": registrar.name, "server": catalog.origin_of(resource), "resource_id": resource_id}
             request = text_of_value(resource.request)
-            registrar.node.emit("progress", **where, request=request, fraction=fraction, text=text)
+            facts = {"request": request, "fraction": fraction, "text": text}
+            if title := registrar.title_of(resource):
+                facts["title"] = title
+            registrar.node.emit("progress", **where, **facts)
         return True
+
+
+def _progressed(
+    query_ids: list[str], resource: Resource, fraction: float, text: str, has: tuple[str, float | None] | None
+) -> Progressed:
+    facts = query_ids, resource.id, resource.server, fraction, text
+    return Progressed(*facts) if has is None else Progressed(*facts, True, *has)
 
 
 def _waiting(catalog: Catalog, resource_id: str) -> dict[str, list[str]]:
@@ -256,9 +284,13 @@ class ProgressListeners:
 
     A consumer that begins to wait may get a report twice: as the newest one, and as one that is sent to all. The
     listener hears it once.
+
+    Attributes:
+        places: by query whose load waits in line, what was said last of its place. Any thread may take one out.
     """
 
     def __init__(self) -> None:
+        self.places: dict[str, Progressed] = {}
         self._by_query: dict[str, Callable[[Progress], None]] = {}
         self._heard: dict[str, Progress] = {}
 
@@ -275,10 +307,18 @@ class ProgressListeners:
         """Return the queries whose loads are listened to."""
         return {*self._by_query, *self._heard}
 
+    def place(self, message: Progressed, query_ids: Iterable[str]) -> None:
+        """Note the place in line of loads that wait."""
+        for query_id in query_ids:
+            if message.text:
+                self.places[query_id] = message
+            else:
+                self.places.pop(query_id, None)
+
     @on_loop
     def hear(self, provider: str, message: Progressed) -> None:
         """Call the listeners for a report that has arrived."""
-        if not self._by_query:
+        if not self._by_query or (message.in_line and not message.text):  # it waits in line no longer
             return
         progress = Progress(message.fraction, message.text, f"{provider}/{message.server}", message.resource_id)
         for query_id in message.query_ids:

@@ -26,7 +26,8 @@ from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.messages import Loaded, LoadRefused, Message
 from rr_actors.registrar.model.rows import Held, Hold
-from rr_actors.registrar.servers.registered_servers import Servers
+from rr_actors.registrar.servers.part_times import PartTimes
+from rr_actors.registrar.servers.registered_servers import RegisteredServers
 from rr_actors.registrar.servers.server_actor import RequestReader
 from rr_actors.registrar.servers.server_base import load_failure
 from rr_actors.runtime.callback_errors import raised_by
@@ -49,9 +50,10 @@ class RegistrarActor(RegistrarBase):
         self.callers: set[UnloadWaiter] = set()  # the callbacks of commands whose end somebody waits for
         self.on_defect: Callable[[BaseException], None] | None = None
         self.progress = ProgressReports(self)
+        self.part_times = PartTimes()
         self.publishers = Publishers(self.node.config.segments_limit_bytes, self.node.dispatcher.loop)
         self.consumers = Consumers(self)
-        self.servers = Servers(self, self.consumers)
+        self.servers = RegisteredServers(self, self.consumers)
         self.clients = ProviderLinks(self)
         self.types = ServerTypes(self, self.clients)
         self.runner = EffectRunner(self, self.consumers, self.servers, self.clients)

@@ -34,8 +34,9 @@ from rr_actors.registrar.links.recorder import Recorder
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.effects import AnswerCall, Effect
 from rr_actors.registrar.model.messages import Gone, Load, Loaded, LoadRefused, Message, Noticed
-from rr_actors.registrar.model.rows import Change, Held, Notice
+from rr_actors.registrar.model.rows import Change, Held, Notice, Resource
 from rr_actors.registrar.model.store import Store
+from rr_actors.registrar.servers.part_times import PartTimes
 from rr_actors.runtime.thread_rules import on_loop, with_lock
 from rr_actors.runtime.workers import Gate
 from rr_actors.streams.publishers import Publishers
@@ -66,7 +67,7 @@ class Runner(Protocol):
         ...
 
 
-class Reader(Protocol):
+class LoadReader(Protocol):
     """Reads the requests in the Loads of consumers."""
 
     def read_first(self, load: Load, sender: str) -> bool:
@@ -129,20 +130,22 @@ class RegistrarBase(RegistrarState, abc.ABC):
     """What the parts of a registrar see of it. RegistrarActor has the parts, and does what they ask of each other.
 
     Attributes:
-        progress, publishers: two parts that the others use.
+        progress, publishers, part_times: parts that the others use.
         runner: carries out the effects; `reader`: reads the requests.
         path: the path of the manager that serves it; without one, that of its process.
         serving: whether on_start has returned, and consumers are let in.
         on_happened: called on the loop after each event of a resource; None: nobody asks.
         listeners: those that hear how far a load has come.
+        titles: of the servers whose requests have titles, what returns them.
         gate: lets one callback of a serial manager in at a time; None: they run side by side.
         outside: the timers' keys of callbacks that wait for room in a gate: their time limits have not begun.
     """
 
     progress: ProgressReports
     publishers: Publishers
+    part_times: PartTimes
     runner: Runner
-    reader: Reader
+    reader: LoadReader
 
     def __init__(self, opening: Opening) -> None:
         self.node, name, config, store, self.peers, self.recorder, self.path = opening
@@ -155,6 +158,7 @@ class RegistrarBase(RegistrarState, abc.ABC):
         self.on_happened: Callable[[], object] | None = None
         self.callback_failures = 0
         self.gate: Gate | None = None
+        self.titles: dict[str, Callable[[bytes], str]] = {}
         self.outside: set[str] = set()
         self.listeners = ProgressListeners()
         self._effects: deque[list[Effect]] = deque()  # those of each decision, to be carried out on the loop
@@ -163,6 +167,11 @@ class RegistrarBase(RegistrarState, abc.ABC):
         self._defect: Exception | None = None  # of a turn, which ends this registrar
         self._changed = asyncio.Event()
         self._held_back: list[tuple[Message, str]] = []
+
+    def title_of(self, resource: Resource) -> str:
+        """Return the title of a resource's request, for people; "" if it has none. From any thread."""
+        title = self.titles.get(resource.server)
+        return "" if title is None else title(resource.request)
 
     # -- messages and commands ---------------------------------------------------------------------------------------
 

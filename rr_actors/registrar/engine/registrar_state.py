@@ -68,7 +68,7 @@ class StopEvent(threading.Event):
             self.cancel()
 
 
-class Asked(Protocol):
+class AskedHere(Protocol):
     """The query that a thread is about to load."""
 
     id: str
@@ -280,7 +280,7 @@ class RegistrarState(TurnActor):
             return Unloaded(unload.query_id)
 
     def begin_directly(
-        self, query: Asked, request: bytes, ended: LoadWaiter, priority: int = 0, own: bool = False
+        self, query: AskedHere, request: bytes, ended: LoadWaiter, priority: int = 0, own: bool = False
     ) -> Load | None:
         """Note a load that the calling thread is about to send; return None if the loop has to send or refuse it.
 

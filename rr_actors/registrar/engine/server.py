@@ -60,6 +60,7 @@ class ServerSpec(msgspec.Struct, frozen=True):
     at_once: int | None = None  # None: as many as ask
     exclusive: bool = False
     grace_s: float | None = None  # None: GRACE_S
+    title: Callback | None = None
 
     @property
     def labels(self) -> str:
@@ -109,6 +110,8 @@ def checked_spec(spec: ServerSpec) -> ServerSpec:
         if spec.at_once is not None and (type(spec.at_once) is not int or spec.at_once < 1):
             _invalid(name, "at_once", "a whole number of at least 1, or None", spec.at_once)
         _check_exclusive(name, spec)
+        if spec.title is not None and not callable(spec.title):
+            _invalid(name, "title", "a function that takes a request and returns a text, or None", spec.title)
         for field in ("load_timeout_s", "recover_timeout_s"):
             limit_s = getattr(spec, field)
             if limit_s is not None and not (is_number(limit_s) and limit_s > 0):

@@ -15,8 +15,8 @@ again.
 from __future__ import annotations
 
 import asyncio
-import functools
 import os
+import time
 import zlib
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -31,6 +31,7 @@ from rr_actors.base.values.failure import failure_of
 from rr_actors.registrar.engine.registrar_base import RegistrarBase
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import digests
+from rr_actors.registrar.model.catalog import Catalog
 from rr_actors.registrar.model.effects import Connect, SendRequest
 from rr_actors.registrar.model.messages import (
     Describe,
@@ -50,7 +51,7 @@ from rr_actors.registrar.model.messages import (
     UnloadRefused,
     WaitedFor,
 )
-from rr_actors.registrar.model.rows import Put, ServerType
+from rr_actors.registrar.model.rows import Hold, Put, ServerType
 from rr_actors.runtime.processes.lifeline import is_ending
 from rr_actors.runtime.thread_rules import any_thread, on_loop
 from rr_actors.wire.name_service import NameEntry, Presence
@@ -66,6 +67,7 @@ _FIRST_RETRY_S = 0.002
 _LAST_RETRY_S = 0.1
 _STARTING_RETRY_S = 0.01  # the longest wait after a provider is up; to look into the directory takes 2 µs
 _STOPPED_RETRY_S = 0.25
+_STAYS_DOWN_S = {Presence.STOPPED: 0.2, Presence.DORMANT: 1.0}  # else it may be between two starts: an import, at most
 _WRITE_AGAIN_S = 0.25
 
 _ANSWERS = frozenset({Loaded, LoadRefused, Unloaded, UnloadRefused, Reprioritised, WaitedFor})
@@ -74,7 +76,7 @@ _A_PROVIDERS = _ANSWERS | {Fetched, Noticed}  # and the side messages (ProviderL
 Fetching = Callable[[list[FetchedQuery] | None, Exception | None], None]
 
 
-class ListQueries(msgspec.Struct, frozen=True, eq=False):
+class FetchQueries(msgspec.Struct, frozen=True, eq=False):
     """Ask for the queries that the registrar holds at the provider; `done` gets them, or the error."""
 
     done: Fetching
@@ -115,6 +117,7 @@ class ProviderLink(TurnActor):
         self._linked = False  # whether there was ever a link
         self._lost_seq = 0  # the running number at which the last link ended (RegistrarState.sequence)
         self._gone = False  # whether the registrar knows that the provider is gone for good
+        self._down: tuple[Presence, float] | None = None  # why the last tries have failed, and since when (monotonic)
         self._described: set[str] = set()
         self.undescribed: set[str] = set()
         self.checksums: dict[str, int] = {}  # by server, those of the types that are known (Loaded.types)
@@ -122,7 +125,7 @@ class ProviderLink(TurnActor):
         self.is_uncalled = False
         self._side: dict[type[Any], Callable[[Any], None]] = {  # messages of the provider that are not decided
             Described: self._take_types,
-            Progressed: functools.partial(self._registrar.listeners.hear, provider),
+            Progressed: self._hear_progress,
         }
         self._unflushed: Link | None = None  # a link with unsent requests
 
@@ -138,7 +141,7 @@ class ProviderLink(TurnActor):
                     self._want()
                 case LearnTypes(server, at_once):
                     self._describe(server, at_once=at_once)
-                case ListQueries(done):
+                case FetchQueries(done):
                     self._fetch(done)
                 case other:
                     raise TypeError(f"{self.actor_ref}: unknown message {type(other).__name__}")
@@ -305,8 +308,9 @@ class ProviderLink(TurnActor):
                 self._unreachable(RegistrarDown(text, registrar=self.provider, status=str(entry.status)), final=True)
             return _STOPPED_RETRY_S  # what is owed there is delivered if it is started again under its name
         self._gone = False
+        stays_down = self._stays_down(entry)
         if entry.status in (Presence.STOPPED, Presence.DORMANT):
-            if self._asked or self._fetching:
+            if self._asked or self._fetching or (stays_down and self._waits()):
                 self._say_releases_wait(entry)
                 text = f"registrar {self.provider!r}: {entry.status}{entry.because}; start it again, or take another"
                 down = RegistrarDown(text, registrar=self.provider, status=str(entry.status))
@@ -325,6 +329,22 @@ class ProviderLink(TurnActor):
             self._unreachable(error, final=False)
             return _STOPPED_RETRY_S
         return None
+
+    def _stays_down(self, entry: NameEntry) -> bool:
+        """Return whether the provider has been down for so long that nothing seems to be about to start it again."""
+        limit_s = None if entry.turn else _STAYS_DOWN_S.get(entry.status)
+        if limit_s is None:
+            self._down = None
+            return False
+        now = time.monotonic()
+        if self._down is None or self._down[0] is not entry.status:
+            self._down = entry.status, now
+        return now - self._down[1] >= limit_s
+
+    def _waits(self) -> bool:
+        """Return whether a load that was sent waits for the provider."""
+        with self._registrar.lock:
+            return self._registrar.whole().waits_for(self.provider)
 
     async def _look_ahead(self) -> digests.HeldRows | None:
         """Return the rows held at the provider with their digests, before the link is there.
@@ -407,6 +427,14 @@ class ProviderLink(TurnActor):
             self._side[kind](message)
         # A notice that comes before the list of queries is sent again behind it.
 
+    def _hear_progress(self, message: Progressed) -> None:
+        registrar = self._registrar
+        if message.in_line:
+            with registrar.lock:  # a thread that has got its answer forgets the place behind this
+                pending = [id for id in message.query_ids if _is_pending(registrar.whole(), id)]
+                registrar.listeners.place(message, pending)
+        registrar.listeners.hear(self.provider, message)
+
     def _take_types(self, message: Described) -> None:
         """Keep the types of a server, if they were asked for or an older version of them is known."""
         server = f"{self.provider}/{message.server}"
@@ -465,6 +493,11 @@ class ProviderLink(TurnActor):
             asked = self._asked
             self._want()
             self._asked = asked  # unchanged: if no caller asks, it is no error that the provider is stopped
+
+
+def _is_pending(catalog: Catalog, query_id: str) -> bool:
+    held = catalog.held.get(query_id)
+    return query_id in catalog.in_flight or (held is not None and held.hold is Hold.PENDING)
 
 
 class ProviderLinks(dict[str, ProviderLink]):

@@ -68,7 +68,7 @@ class Recorder:
 
         `detail`: "attempt 2" of one that a crash has interrupted before, and the error that ended it.
         """
-        registrar = server.partition("/")[0]
+        registrar = server.rpartition("/")[0]
         where = (self._path, self._pid, registrar)
         self._add(Entry(time.time(), event, 0, *where, "", role, "", resource, "", server, detail))
 

@@ -35,6 +35,7 @@ from rr_actors.registrar.model.rows import (
     Content,
     Drop,
     Held,
+    Hold,
     Notice,
     Peer,
     Put,
@@ -389,6 +390,11 @@ class Catalog:
         """Return whether a link is needed: the provider may have queries of ours, or is to get an acknowledgement."""
         unknown = provider in self.peers and (self.epoch > 1 or provider not in self.agreed)
         return unknown or provider in self.outbound or provider in self.acked
+
+    def waits_for(self, provider: str) -> bool:
+        """Return whether a load that the event loop has sent, or will send, waits for the provider."""
+        unsettled = self.unsettled_at(provider)
+        return any(held.hold is Hold.PENDING and held.id not in self.direct for held in unsettled)
 
     def last_number(self) -> int:
         """Return a running number that no query of this incarnation exceeds, and every one of the next does."""

@@ -139,10 +139,15 @@ class InLine(Effect, frozen=True):
     """Tell the load that waits for a QUEUED resource its place in line; "": it waits no longer.
 
     Nothing derives it again: the next change of the line says the places anew.
+
+    Attributes:
+        holder: the registrar that has the resource; "": nobody does. `since`: when that one asked for it.
     """
 
     resource_id: str
     text: str
+    holder: str = ""
+    since: float | None = None
 
 
 Happening = Literal[

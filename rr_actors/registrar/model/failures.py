@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rr_actors.base.errors import LoadError, did_you_mean, shortened, shown
-from rr_actors.base.names import made_at
+from rr_actors.base.errors import LoadError, counted, did_you_mean, shortened, shown
+from rr_actors.base.names import time_in
 from rr_actors.base.values.canonical import shown_plain
 from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.model.catalog import Catalog
@@ -172,7 +172,7 @@ def busy(catalog: Catalog, server: str, request: bytes, has: ServedQuery | None,
         waiting: how many others wait.
     """
     origin = f"{catalog.name}/{server}"
-    holder, since = ("", None) if has is None else (has.origin, _asked_at(has.id))
+    holder, since = holder_since(has)
     who = f"{holder} has it" if holder else "it is being unloaded"
     others = "" if not waiting else f", and {waiting} {'waits' if waiting == 1 else 'wait'} for it"
     what = f"{origin} with {shown(shown_plain(request))}"
@@ -181,18 +181,16 @@ def busy(catalog: Catalog, server: str, request: bytes, has: ServedQuery | None,
     return Failure("ResourceBusy", text, details, [(origin, f"{who}{others}")])
 
 
-def _asked_at(query_id: str) -> float | None:
-    try:
-        return made_at(query_id)
-    except ValueError:  # an id that this package has not made
-        return None
+def holder_since(has: ServedQuery | None) -> tuple[str, float | None]:
+    """Return the registrar that has a resource by this query, and when it asked for it, in seconds since 1970."""
+    return ("", None) if has is None else (has.origin, time_in(has.id))
 
 
 def left_behind(catalog: Catalog, resources: Sequence[Resource]) -> Failure:
     """Return the failure of the unregistration of a server, some of whose unload callbacks raised."""
     first = resources[0]
     origin = catalog.origin_of(first)
-    text = f"{origin}: {len(resources)} of its resources could not be unloaded; {first.id}: {first.message}"
+    text = f"{origin}: {counted(len(resources), 'resource')} of it could not be unloaded; {first.id}: {first.message}"
     return Failure("UnloadFailed", text, {"resource_id": first.id, "server": origin}, [(origin, first.message)])
 
 

@@ -178,13 +178,20 @@ class Gone(msgspec.Struct, frozen=True, array_like=True, tag=14):
 
 
 class Progressed(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=15):
-    """The progress of a load for which these queries of the receiver wait. May be lost."""
+    """The progress of a load for which these queries of the receiver wait. May be lost.
+
+    `in_line`: it waits for an exclusive resource, and `text` is its place. `holder`: the registrar that has that, "" if
+    none does; `since`: when that one asked for it, in seconds since 1970.
+    """
 
     query_ids: list[str]
     resource_id: str
     server: str
     fraction: float
     text: str
+    in_line: bool = False
+    holder: str = ""
+    since: float | None = None
 
 
 class Reprioritise(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=16):

@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 
 from rr_actors.base.errors import readable, shortened
-from rr_actors.base.values.canonical import shown_plain
+from rr_actors.base.values.canonical import text_of_value
 from rr_actors.registrar.model import messages as m
 from rr_actors.registrar.model.messages import Message
 from rr_actors.registrar.model.rows import shown_priority
@@ -39,7 +39,7 @@ class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
         parent: what it is for: of a load, the sender's resource; of a message between actors, the message that its
             sender was handling, or the resource whose callback the sender ran.
         server: "registrar/server", if it is known.
-        detail: a request, a message, an error or a status, for people.
+        detail: a request (as JSON), a message, an error or a status, for people.
         facts: all the facts of an event of the tree.
     """
 
@@ -66,7 +66,7 @@ def message_entry(at: float, event: str, process: str, pid: int, registrar: str,
         case m.Load():
             provider = peer if event == "sent" else registrar
             size = len(message.request)
-            request = shortened(repr(shown_plain(message.request))) if size <= _LONG else f"<{size} bytes>"
+            request = shortened(text_of_value(message.request)) if size <= _LONG else f"<{size} bytes>"
             return Entry(*where, message.query_id, "", message.parent, f"{provider}/{message.server}", request)
         case m.Loaded():
             return Entry(*where, message.query_id, message.resource_id)

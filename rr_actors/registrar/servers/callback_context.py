@@ -57,13 +57,14 @@ class Current(msgspec.Struct, frozen=True):
 
     @property
     def name(self) -> str:
-        """The resource's name for people, its server and its request: `cameras/camera "/dev/video7"`.
+        """The resource's name for people, its server and its request, or that's title: `cameras/camera "/dev/video7"`.
 
         It is shortened to 500 characters. "" for a message.
         """
         if self._registrar is None:
             return ""
-        return named(self._place, text_of_value(self._request), NAME_LIMIT)
+        title = self._registrar.titles.get(self.server)
+        return named(self._place, (title and title(self._request)) or text_of_value(self._request), NAME_LIMIT)
 
     @property
     def _place(self) -> str:

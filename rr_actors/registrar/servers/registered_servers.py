@@ -1,4 +1,4 @@
-"""Servers: the servers of one registrar, by name; and their stored values, read again when they are registered.
+"""The servers of one registrar, by name; and their stored values, read again when they are registered.
 
 GatedServer: a server whose callbacks need room: `at_once`, or a serial manager. They wait for it in its mailbox.
 """
@@ -28,7 +28,7 @@ from rr_actors.runtime.thread_rules import any_thread, on_loop
 from rr_actors.runtime.workers import Gate
 
 
-class Servers:
+class RegisteredServers:
     """The servers of one registrar, by name; get() returns None if there is none."""
 
     def __init__(self, registrar: RegistrarBase, consumers: Consumers) -> None:
@@ -51,6 +51,9 @@ class Servers:
             raise NameTaken(text, name=name)
         registrar.node.directory.put_labels(registrar.name, name, server.spec.labels)
         self._by_name[name] = server
+        registrar.titles.pop(name, None)
+        if server.title is not None:
+            registrar.titles[name] = server.title
         left = [] if old is None else old.end()
         server.begin()
         for message in left:
@@ -89,6 +92,7 @@ class Servers:
         def ended(error: RrError | None) -> None:
             if name not in registrar.catalog.servers and (server := self._by_name.pop(name, None)) is not None:
                 server.end()
+                registrar.titles.pop(name, None)
                 registrar.node.directory.put_labels(registrar.name, name, "")
             done(error)
 

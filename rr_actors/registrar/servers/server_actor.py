@@ -14,7 +14,7 @@ import threading
 import time
 import zlib
 from collections import deque
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Sequence
 from typing import Any
 
 import msgspec
@@ -41,10 +41,11 @@ from rr_actors.registrar.model.roles import BEGUN, HEALTH, LOAD, RECOVER, RELOAD
 from rr_actors.registrar.model.rows import UNLOADING, Notice, Resource
 from rr_actors.registrar.servers.callback_context import Current, enter
 from rr_actors.registrar.servers.on_demand_callbacks import HealthCallbacks, UsageCallbacks
+from rr_actors.registrar.servers.request_titles import title_maker
 from rr_actors.registrar.servers.server_base import (
     CallbackFailure,
     OnDemandRun,
-    Run,
+    RunningCallback,
     failure_of_callback,
     load_failure,
     nothing,
@@ -59,10 +60,11 @@ from rr_actors.wire.frames import ADVICE
 
 logger = Log("rr_actors.server")
 
-_NEWEST = 500  # load callbacks of a server, of which the times are kept
 _ROW_BYTES = 1024  # room for the names and ids that are sent with a request, a response, or types
 
 Message = StartCallback | OnDemandRun
+
+_NEWEST = 500  # load callbacks of a server, of which the times are kept
 
 
 class LoadTimes:
@@ -70,30 +72,37 @@ class LoadTimes:
 
     Attributes:
         loaded, failed: how many have returned, and raised.
-        seconds: how long they took together.
+        seconds: how long they took together; `own_seconds`: without the time in which they waited for their parts.
         longest_s: how long the longest took.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._newest: deque[float] = deque(maxlen=_NEWEST)
+        self._newest: deque[tuple[float, float]] = deque(maxlen=_NEWEST)
         self.loaded = self.failed = 0
-        self.seconds = self.longest_s = 0.0
+        self.seconds = self.own_seconds = self.longest_s = 0.0
 
-    def take(self, took_s: float, *, failed: bool) -> None:
-        """Count a callback that has ended, and took so long."""
+    def take(self, took_s: float, in_parts_s: float, *, failed: bool) -> None:
+        """Count a callback that has ended, took so long, and waited so long of that for its parts."""
+        own_s = max(0.0, took_s - in_parts_s)
         with self._lock:
             self.failed += failed
             self.loaded += not failed
             self.seconds += took_s
+            self.own_seconds += own_s
             self.longest_s = max(self.longest_s, took_s)
-            self._newest.append(took_s)
+            self._newest.append((took_s, own_s))
 
-    def p95_s(self) -> float:
-        """Return the time within which 95 % of the newest 500 callbacks ended; 0.0 if none has ended."""
+    def p95_s(self) -> tuple[float, float]:
+        """Return the time within which 95 % of the newest 500 callbacks ended, and their own p95; 0.0 if none has."""
         with self._lock:
-            newest = sorted(self._newest)
-        return newest[math.ceil(0.95 * len(newest)) - 1] if newest else 0.0
+            newest = list(self._newest)
+        return _p95(took_s for took_s, _ in newest), _p95(own_s for _, own_s in newest)
+
+
+def _p95(times: Iterable[float]) -> float:
+    in_order = sorted(times)
+    return in_order[math.ceil(0.95 * len(in_order)) - 1] if in_order else 0.0
 
 
 class ServerActor(TurnActor):
@@ -104,6 +113,7 @@ class ServerActor(TurnActor):
         usage, health: these two callbacks.
         inside: the callbacks that run now, each with the name of its role. From any thread.
         digest: of the types of requests and responses.
+        title: returns the title of a request, given as canonical bytes; None: its requests have none.
 
     Raises:
         InvalidSpec: a callback has attributes that cannot be read.
@@ -125,6 +135,7 @@ class ServerActor(TurnActor):
         "response",
         "restored",
         "spec",
+        "title",
         "usage",
     )
     gate: Gate | None = None
@@ -147,6 +158,7 @@ class ServerActor(TurnActor):
         self._runs_again = spec.recover is not None or self.facts.recovery != "keep"
         self.request = Codec(spec.request_type, f"{self.origin}: request")
         self.response = Codec(spec.response_type, f"{self.origin}: response")
+        self.title = title_maker(spec, self.origin)
         self.digest = digest_of((self.request.shape, self.response.shape))
         self._runs: dict[Role, Callback] = {}
         for role in BEGUN.values():
@@ -265,7 +277,7 @@ class ServerActor(TurnActor):
             return
         heard = None if effect.notice is None else self._received(effect.notice, repeated=effect.repeated)
         number = resource.tries if role is UNLOAD else resource.attempt
-        run = Run(role, effect, number, heard, time.monotonic())
+        run = RunningCallback(role, effect, number, heard, time.monotonic())
         if role in (UNLOAD, RELOAD, STATUS) and getattr(self.spec, role.option) is None:
             self._run_ended(run, None, None)
             return
@@ -282,7 +294,7 @@ class ServerActor(TurnActor):
             return status_of(notice, StatusMessage, repeated=repeated)
         return audience.received(notice, repeated=repeated)
 
-    def _start(self, run: Run) -> None:
+    def _start(self, run: RunningCallback) -> None:
         role = run.role
         instead = LOAD if role is RECOVER and (run.effect.reload or self.spec.recover is None) else None
         at_once = functools.partial(self._ended_here, run) if role in (LOAD, UNLOAD) else None
@@ -290,7 +302,7 @@ class ServerActor(TurnActor):
         done = functools.partial(self._run_ended, run)
         self._run(role, run.effect.resource, run.number, done, *more, instead=instead, at_once=at_once)
 
-    def _ended_here(self, run: Run, response: bytes | None) -> bool:
+    def _ended_here(self, run: RunningCallback, response: bytes | None) -> bool:
         """Decide the end in the thread that ran the callback; return False if the loop has to."""
         resource = run.effect.resource
         if run.role is LOAD:
@@ -303,20 +315,25 @@ class ServerActor(TurnActor):
         took_s = time.monotonic() - run.began_s if run.role is LOAD else 0.0
         ended = CallbackEnded(run.role.name, resource.id, run.number, None, response, took_s=took_s)
         is_decided = self.registrar.decide_here(ended)
-        if is_decided and run.role is LOAD:
-            self.load_times.take(took_s, failed=False)
+        if is_decided:
+            self._count(run, took_s, failed=False)
         return is_decided
 
-    def _run_ended(self, run: Run, response: bytes | None, error: BaseException | None) -> None:
+    def _count(self, run: RunningCallback, took_s: float, *, failed: bool) -> None:
+        parts = self.registrar.part_times
+        in_parts_s = parts.take(run.effect.resource.id) if parts.waits else 0.0
+        if run.role is LOAD:
+            self.load_times.take(took_s, in_parts_s, failed=failed)
+
+    def _run_ended(self, run: RunningCallback, response: bytes | None, error: BaseException | None) -> None:
         role, resource = run.role, run.effect.resource
         if role.reports:
             self.registrar.progress.end(resource.id)
         if role.answer:
             error = error or self.too_long(resource, response)
         took_s = time.monotonic() - run.began_s if role is LOAD else 0.0
-        if role is LOAD:
-            self.load_times.take(took_s, failed=error is not None)
-        elif role is STATUS and error is not None:
+        self._count(run, took_s, failed=error is not None)
+        if role is STATUS and error is not None:
             self.registrar.callback_failures += 1
         self._streams_after(run, failed=error is not None)
         failure = None if error is None else failure_of_callback(role, self.origin, resource, error)
@@ -326,7 +343,7 @@ class ServerActor(TurnActor):
         stopped = role is LOAD and type(error) is Raised and error.details.was_stopped
         self.registrar.post(CallbackEnded(*end, run.effect.notice, handled, took_s, stopped))
 
-    def _streams_after(self, run: Run, *, failed: bool) -> None:
+    def _streams_after(self, run: RunningCallback, *, failed: bool) -> None:
         """Let readers in to the streams that a callback has opened; close those of a resource that is gone."""
         publishers, id = self.registrar.publishers, run.effect.resource.id
         if run.role.reports and not failed:

@@ -125,7 +125,7 @@ class OnDemandRun(msgspec.Struct, frozen=True, gc=False):
     done: Done
 
 
-class Run(msgspec.Struct, frozen=True, gc=False):
+class RunningCallback(msgspec.Struct, frozen=True, gc=False):
     """One run of a callback.
 
     Attributes:
@@ -198,6 +198,8 @@ def tell_stream(
         return
     facts = {"registrar": server.registrar.name, "server": server.origin, "resource_id": resource.id}
     facts |= {"request": text_of_value(resource.request), "stream": stream.name, "detail": stream.name}
+    if title := server.registrar.title_of(resource):
+        facts["title"] = title
     if before is not None:
         instead = f"{before.name} of resource {short_id(before.resource_id)}"
         facts["detail"] += f", read by {reader} instead of {instead}"

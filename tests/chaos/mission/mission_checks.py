@@ -11,7 +11,8 @@ from chaos.callback_log import Line
 from chaos.mission.mission_managers import ACT, ACTED, ALTERNATIVES, RELEASED, SEEN, STEPS
 from rr_actors.base.values.canonical import shown_plain
 from rr_actors.managers import Choose, Kept
-from rr_actors.managers.actions.graph_runs import LIVE, MOST_ATTEMPTS, run_in
+from rr_actors.managers.actions.graph_documents import run_in
+from rr_actors.managers.actions.graph_runs import LIVE, MOST_ATTEMPTS
 from rr_actors.managers.choices.alternatives import key_of
 from rr_actors.managers.choices.matching import ranked
 from rr_actors.registrar.model.rows import Held, Phase, Resource, State

@@ -14,7 +14,8 @@ from chaos.mission.mission_managers import CHOICES, DESIRED, GRAPH, RELEASED, SE
 from chaos.report import Tally
 from rr_actors.base.errors import RrError
 from rr_actors.managers import Choose, RunGraph
-from rr_actors.managers.actions.graph_runs import ENDED, OVER, run_in
+from rr_actors.managers.actions.graph_documents import run_in
+from rr_actors.managers.actions.graph_runs import ENDED, OVER
 from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Query, Status
 from rr_actors.registrar.registrar import Registrar
