@@ -1105,7 +1105,7 @@ class Registrar(Consumer):
 
         Returns:
             A dict, by resource id, of dicts of numbers. `.failures` says, by resource id, why a usage is not known: a
-            callback that raises, hangs, or returns something else than finite numbers holds up no other.
+            callback that raises, hangs, or returns anything other than finite numbers holds up no other.
 
         Raises:
             UsageError: a usage callback of this registrar made the call, or the call would hang in this thread; or an

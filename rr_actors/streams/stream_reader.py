@@ -69,7 +69,7 @@ class StreamReader:
     One thread or task at a time reads it, or several that take turns.
 
     Raises:
-        UsageError: an argument is something else than Query.stream() says, or no name, and there are several streams.
+        UsageError: an argument is not what Query.stream() says; or no name is given, and there are several streams.
         NotFound: the resource has streams, and none of this name. `.id`, `.known`
         Unavailable: there is no descriptor for it.
     """

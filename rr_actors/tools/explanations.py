@@ -122,7 +122,8 @@ def _of_resource(client: ConsoleClient, resource: ResourceRow) -> Iterator[str]:
     if resource.message.startswith(WAITS_FOR_SERVER):
         yield f"It {resource.message}."
     elif resource.revoked:
-        yield f"It is revoked ({resource.message}): it is unloaded when its holders have let it go, or at the deadline."
+        when = "when its holders have released it, or at the deadline"
+        yield f"It is revoked ({resource.message}): it is unloaded {when}."
     elif resource.message and resource.phase in ("loaded", "unloading", "paused"):
         yield f"Its last status was {resource.state}: {resource.message}"
     yield from _past_of(client, resource)

@@ -104,12 +104,12 @@ TABLE = [
     (
         "a load that waits",
         Known(NOW, waiting=[waits(9)], loads=[loads(0)], standing={"s/slow": "a.py:7, in A.load"}),
-        [("WARNING", 's/slow "y" is waited for since 9 s; the callback stands in a.py:7, in A.load')],
+        [("WARNING", 'a load of s/slow "y" has waited for 9 s; the callback stands in a.py:7, in A.load')],
     ),
     (
         "a load that is usually quick",
         Known(NOW, waiting=[waits(4)], loads=[loads(0.3)]),
-        [("WARNING", 's/slow "y" is waited for since 4 s, usually 0.3 s at most')],
+        [("WARNING", 'a load of s/slow "y" has waited for 4 s, usually 0.3 s at most')],
     ),
     ("a pool with room", Known(NOW, pools=[PoolUse("root/b", "watts", 100, 90, 0)]), []),
     (

@@ -710,7 +710,7 @@ def test_a_revocation_is_explained(app: rr.Registrar, shop: rr.System) -> None:
     revoking = threading.Thread(target=provider.revoke, args=(query.resource_id, "too hot"), kwargs={"grace_s": 60})
     revoking.start()
     assert heard.wait(60)
-    assert "It is revoked (too hot): it is unloaded when its holders have let it go" in said("why", query.resource_id)
+    assert "It is revoked (too hot): it is unloaded when its holders have released it" in said("why", query.resource_id)
     (row,) = said("resources", "--status", "revoked").splitlines()[1:]
     assert row.split()[:3] == ["provider/thing", '"x"', "revoked"]
     assert said("resources", "--status", "fatal").splitlines()[1:] == [row]

@@ -253,7 +253,7 @@ class ConsoleClient:
                 raise NotRunning(f"{self._who()} has ended, or closed the connection")
             self._answers += self._frames.feed(data)
             if self._frames.error is not None and not self._answers:
-                raise Unavailable(f"{self._who()} said something else than answers: {self._frames.error}")
+                raise Unavailable(f"{self._who()} sent something other than answers: {self._frames.error}")
         return self._answers.popleft()
 
     def _who(self) -> str:

@@ -84,7 +84,7 @@ def no_query(row: Row) -> str:
     """Return why a row has no query that could be released; "" if it has one."""
     if not (row.query or row.resource):
         return "choose a resource or a holder on the right (Tab goes there)"
-    return "" if row.query else "it has not one holder: Enter shows them; U takes it away from all"
+    return "" if row.query else "it has no holder, or several: Enter shows them; U takes it away from all"
 
 
 CHILD_COMMANDS = (

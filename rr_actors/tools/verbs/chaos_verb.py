@@ -23,9 +23,9 @@ _INTERRUPTED = 130  # as a shell has it
 
 @app.command(epilog="Example: rr-actors chaos --kills 20 --only cameras")
 def chaos(
-    kills: Annotated[int, typer.Option(metavar="N", min=1, help="End after so many kills.")] = 10,
+    kills: Annotated[int, typer.Option(metavar="N", min=1, help="End after this many kills.")] = 10,
     seconds: Annotated[
-        float | None, typer.Option(metavar="S", min=0.0, help="Begin no kill after so many, if that is sooner.")
+        float | None, typer.Option(metavar="S", min=0.0, help="Begin no kill after this time, if that is sooner.")
     ] = None,
     only: Annotated[
         list[str] | None,

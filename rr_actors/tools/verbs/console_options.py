@@ -79,10 +79,10 @@ DryRun = Annotated[bool, typer.Option("--dry-run", help="Change nothing; say wha
 Timeout = Annotated[
     float, typer.Option("--timeout", metavar="SECONDS", min=0.0, max=c.TIMEOUT_LIMIT_S, help="How long it may take.")
 ]
-Limit = Annotated[int, typer.Option("--limit", min=1, help="Show at most so many.")]
+Limit = Annotated[int, typer.Option("--limit", min=1, help="Show at most this many.")]
 RowLimit = Annotated[
     int | None,
-    typer.Option("--limit", min=1, show_default=False, help=f"Show at most so many; {SHOWN} in a table, else all."),
+    typer.Option("--limit", min=1, show_default=False, help=f"Show at most this many; {SHOWN} in a table, else all."),
 ]
 complete_child = completing(list_children)
 ParentOption = Annotated[

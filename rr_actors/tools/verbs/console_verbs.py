@@ -64,7 +64,7 @@ def events(
     server: Annotated[
         str, typer.Option(help="Only of this server or registrar.", autocompletion=completing(list_servers))
     ] = "",
-    count: Annotated[int | None, typer.Option(min=1, help="End after so many.")] = None,
+    count: Annotated[int | None, typer.Option(min=1, help="End after this many events.")] = None,
     state: StateOption = None,
     as_json: JsonOption = False,
 ) -> None:

@@ -64,7 +64,7 @@ def record(
         Path, typer.Argument(metavar="FILE", help="A new file, for `trace`, `sequence` and rr.read_recording().")
     ],
     seconds: Annotated[
-        float | None, typer.Option(min=0.0, max=threading.TIMEOUT_MAX, help="End after so many. Default: at Ctrl-C.")
+        float | None, typer.Option(min=0.0, max=threading.TIMEOUT_MAX, help="End after this time. Default: at Ctrl-C.")
     ] = None,
     state: StateOption = None,
 ) -> None:
@@ -115,7 +115,7 @@ _What = Annotated[
     ),
 ]
 _Seconds = Annotated[
-    float, typer.Option(min=0.0, max=threading.TIMEOUT_MAX, help="Without a file: record for so long.")
+    float, typer.Option(min=0.0, max=threading.TIMEOUT_MAX, help="Without a file: record for this time.")
 ]
 
 
@@ -273,7 +273,9 @@ def graph(
 @app.command(epilog="Example: rr-actors logs cameras --previous --lines 20")
 def logs(
     child: ChildArgument,
-    lines: Annotated[int, typer.Option("--lines", "-n", min=1, help="The newest so many.")] = c.PAGE_LIMIT,
+    lines: Annotated[
+        int, typer.Option("--lines", "-n", min=1, help="Show this many of the newest lines.")
+    ] = c.PAGE_LIMIT,
     previous: Annotated[
         bool, typer.Option("--previous", "-p", help="Only those of the process before the one that runs.")
     ] = False,
@@ -345,7 +347,7 @@ def stream(
         int, typer.Option("--limit-bytes", min=1, help="With --record: the most that the file may have.")
     ] = LIMIT_BYTES,
     count: Annotated[
-        int | None, typer.Option(min=1, help="End after so many lines or frames. Default: at Ctrl-C.")
+        int | None, typer.Option(min=1, help="End after this many lines or frames. Default: at Ctrl-C.")
     ] = None,
     timeout_s: Annotated[
         float, typer.Option("--timeout", metavar="SECONDS", min=0.0, max=86_400.0, help="The longest wait for a frame.")

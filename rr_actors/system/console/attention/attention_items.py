@@ -263,7 +263,7 @@ def _of_loads(known: Known) -> Iterator[AttentionItem]:
         usual = f", usually {p95[server]:.2g} s at most" if p95.get(server) else ""
         line = known.standing.get(server, "")
         stands = f"; the callback stands in {line}" if line else f": {first.said}" if first.said else ""
-        what = f"{first.name} is waited for since {ago(known.now - since)}{usual}{stands}"
+        what = f"a load of {first.name} has waited for {ago(known.now - since)}{usual}{stands}"
         touches = tuple(dict.fromkeys(row.origin for row in rows))
         registrar = server.partition("/")[0]
         command = f"stack {registrar}" if line else f"why {short_id(first.id)}"
