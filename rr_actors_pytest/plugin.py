@@ -37,6 +37,12 @@ sys.meta_path.insert(0, _AsWritten())
 _HOME = Path(__file__).parents[1]  # of a checkout, where the package's own tests run
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add --rr-races."""
+    text = "fail tests in which callbacks of a manager in rr_system read and write an attribute at the same time"
+    parser.getgroup("rr_actors").addoption("--rr-races", action="store_true", help=text)
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> None:
     """Show the user's own lines of a failing test: without --full-trace pytest hides the package's frames.
@@ -50,14 +56,16 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
 
 
 @pytest.fixture
-def rr_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[rr.StartSystem]:
+def rr_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pytestconfig: pytest.Config) -> Iterator[rr.StartSystem]:
     """Start a system of rr_actors: rr_system(rr.ChildSpec(Cameras, id="cameras"), config=...).
 
     Its state is in the test's tmp_path, unless `state_dir` says otherwise. After the test each system is stopped, which
     releases what the test holds. The test fails if a process, a thread, a socket or a loaded resource is left then.
+    With `pytest --rr-races` it also fails if callbacks of a manager race for an attribute.
     """
     from rr_actors.testing.started_systems import started_systems
 
-    left = yield from started_systems(tmp_path, monkeypatch.setenv)
-    if left:
-        pytest.fail(f"rr_system: left behind: {'; '.join(left)}", pytrace=False)
+    races = pytestconfig.getoption("--rr-races") is True
+    wrong = yield from started_systems(tmp_path, monkeypatch.setenv, races=races)
+    if wrong:
+        pytest.fail("\n".join(f"rr_system: {line}" for line in wrong), pytrace=False)

@@ -186,3 +186,47 @@ class Lamps(rr.Manager):
     @set_scene.recover
     async def find_scene(self, name: str, response: str) -> str:
         return response
+
+
+class CountsByItself(rr.Manager):
+    """Two loads at once may count as one."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    @rr.server("port")
+    def open_port(self, device: str) -> str:
+        before = self.count
+        self.count = before + 1
+        return device
+
+
+class OpensTwice(rr.Manager):
+    """Two loads at once may both find that a bus is not open."""
+
+    def __init__(self) -> None:
+        self.buses: dict[str, str] = {}
+
+    @rr.server("port")
+    def open_port(self, device: str) -> str:
+        if "bus" not in self.buses:
+            self.buses["bus"] = "open"
+        return device
+
+
+class CountsWithALock(rr.Manager):
+    """What CountsByItself does, with a lock."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.lock = threading.Lock()
+
+    @rr.server("port")
+    def open_port(self, device: str) -> str:
+        with self.lock:
+            self.count += 1
+        return device
+
+
+class CountsSerially(CountsByItself, serial=True):
+    """What CountsByItself does, one callback at a time."""

@@ -21,7 +21,8 @@ class Note(msgspec.Struct, frozen=True):
 
     Attributes:
         pid: the process that wrote it.
-        what: "started", "server", "begin", "end", "raised", "killed", "blocked", "opened", "closed" or "census".
+        what: "started", "server", "begin", "end", "raised", "killed", "blocked", "opened", "closed", "race" or
+            "census".
         role: the name of the callback's role.
         name: the resource's name for people.
         attempt: 1 at first; more if a crash interrupted an earlier run of the callback.
@@ -42,8 +43,9 @@ class Note(msgspec.Struct, frozen=True):
     def __str__(self) -> str:
         about = f"{self.role} {self.name}".strip()
         again = f" (attempt {self.attempt})" if self.attempt > 1 else ""
-        first = self.text.strip().rpartition("\n")[2]
-        return f"{self.pid}  {self.what:<8}{about}{again}{': ' if first and about else ''}{first}"
+        lines = self.text.strip().split("\n")
+        said = lines[0] if self.what == "race" else lines[-1]
+        return f"{self.pid}  {self.what:<8}{about}{again}{': ' if said and about else ''}{said}"
 
 
 class Notebook:
@@ -69,6 +71,12 @@ class Notebook:
     def append(self, note: Note) -> None:
         """Append a note."""
         os.write(self._fd, msgspec.json.encode(note) + b"\n")
+
+
+def append_note(directory: str, note: Note) -> None:
+    """Append a note, from a process that keeps no notebook."""
+    with (Path(directory) / _FILE).open("ab", buffering=0) as file:
+        file.write(msgspec.json.encode(note) + b"\n")
 
 
 class NoteReader:

@@ -23,19 +23,21 @@ from rr_actors.base.errors import NotSerializable, UsageError, did_you_mean, is_
 from rr_actors.registrar.manager import Manager, declared_servers
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor
 from rr_actors.testing.failure_programs import program_of, written
-from rr_actors.testing.scenario_notes import PROMISES, Fault
+from rr_actors.testing.scenario_notes import PROMISES, RACES, Fault
 from rr_actors.testing.scenario_stage import ServerFacts, Setup, Stage
 from rr_actors.testing.scenario_steps import (
     AskUsage,
     Fatal,
     Kill,
     Load,
+    LoadTogether,
     Pause,
     Reload,
     Resume,
     SendStatus,
     Step,
     Unload,
+    UnloadTogether,
     Update,
     Wrong,
 )
@@ -50,6 +52,7 @@ _LINES = 12  # a callback has seldom more
 _SCENARIOS_WITHOUT_KILLS = 20
 _PER_KILL = 20  # scenarios: many are like others, or have no kill that strikes
 _SKIPPED = 10
+_MEETINGS = 6  # scenarios in which load callbacks run at the same time, before all others
 _SHOW_S = 1.0
 _REFUSED_ALL = 12
 _STORY = 40
@@ -145,9 +148,13 @@ def check_manager(
     refused: dict[str, Sequence[Any]] = dict.fromkeys(strategies, (_WRONG,))
     if wrong is not None:
         refused |= _by_server("wrong", wrong, names, (list, tuple), "a list of requests")
+    serial = cast("type[Manager]", setup.child.actor_class_or_manager).serial
     with _quiet(), Stage(setup) as stage:
         search = _Search(stage, setup, kills, time.monotonic() + limit_s, progress)
-        search.run(_scenarios(strategies, refused, stage.servers, with_kills=kills > 0), seed)
+        if not serial:
+            search.run(_together(strategies), seed, _MEETINGS, only=RACES)
+        scenarios = _scenarios(strategies, refused, stage.servers, with_kills=kills > 0, serial=serial)
+        search.run(scenarios, seed, _PER_KILL * kills or _SCENARIOS_WITHOUT_KILLS)
         return search.result()
 
 
@@ -258,6 +265,7 @@ def _scenarios(
     servers: Mapping[str, ServerFacts],
     *,
     with_kills: bool,
+    serial: bool,
 ) -> SearchStrategy[list[Step]]:
     """Return the strategy of scenarios. What it gives first is what a failure is shrunk to."""
     from hypothesis import strategies as st
@@ -276,6 +284,8 @@ def _scenarios(
         st.builds(Reload, which),
         st.one_of(loads),
     ]
+    if not serial:
+        steps += [_together(requests).map(operator.itemgetter(0)), st.builds(UnloadTogether)]
     if "pause" in roles:
         steps += [st.builds(Pause, which, line), st.builds(Resume, which, line)]
     if "usage" in roles:
@@ -283,8 +293,21 @@ def _scenarios(
     refused = [st.builds(Wrong, st.just(server), st.sampled_from(of)) for server, of in wrong.items() if of]
     if refused:
         steps.append(st.one_of(refused))
-    some = st.lists(st.none() | st.one_of(steps), min_size=_STEPS, max_size=_STEPS)  # None is left out: it is simplest
-    return st.builds(_without_none, st.one_of(st.none(), *loads, *loads), some)
+    drawn = st.lists(st.none() | st.one_of(steps), min_size=_STEPS, max_size=_STEPS)  # None is left out: it is simplest
+    return st.builds(_without_none, st.one_of(st.none(), *loads, *loads), drawn)
+
+
+def _together(requests: Mapping[str, SearchStrategy[Any]]) -> SearchStrategy[list[Step]]:
+    """Return the strategy of scenarios of one step, in which load callbacks of one server run at the same time."""
+    from hypothesis import strategies as st
+
+    some = {server: st.lists(of, min_size=2, max_size=3) for server, of in requests.items()}
+
+    def alone(step: Step) -> list[Step]:
+        return [step]
+
+    loads = [st.builds(LoadTogether, st.just(server), of.map(tuple)) for server, of in some.items()]
+    return st.one_of(loads).map(alone)
 
 
 def _without_none(first: Step | None, more: list[Step | None]) -> list[Step]:
@@ -300,7 +323,12 @@ def _normal(steps: Sequence[Step]) -> list[Step]:
             if not held:
                 continue
             step = replace(step, which=which % held)  # pyright: ignore[reportCallIssue] - it has that field
+        if isinstance(step, UnloadTogether):
+            if not held:
+                continue
+            held = 0
         held += isinstance(step, Load | Fatal) - isinstance(step, Unload)
+        held += len(step.requests) if isinstance(step, LoadTogether) else 0
         found.append(step)
     return found
 
@@ -328,15 +356,16 @@ class _Search:
         self._last: tuple[list[Step], Fault] | None = None
         self.scenarios = 0
 
-    def run(self, scenarios: SearchStrategy[list[Step]], seed: int) -> None:
-        """Play scenarios.
+    def run(self, scenarios: SearchStrategy[list[Step]], seed: int, count: int, only: str = "") -> None:
+        """Play scenarios, at most `count`.
+
+        Args:
+            only: the promise that they are about; "": all.
 
         Raises:
             ManagerFault: one shows a fault.
         """
         import hypothesis as h
-
-        count = _PER_KILL * self._kills or _SCENARIOS_WITHOUT_KILLS
 
         @h.seed(seed)
         @h.settings(
@@ -352,7 +381,7 @@ class _Search:
         def play(steps: list[Step]) -> None:
             steps = _normal(steps)
             fault = self._play(steps)
-            if fault is not None:
+            if fault is not None and only in ("", fault.promise):
                 self._last = steps, fault
                 raise _FOUND[fault.promise]
 
@@ -388,7 +417,7 @@ class _Search:
     def _is_new(self, steps: list[Step]) -> bool:
         """Return whether a scenario has a step, or two in a row, that no other has had; now and then True anyway."""
         killed = [(type(step), getattr(step, "kill_at", None) is not None) for step in steps]
-        single = [(type(step), getattr(step, "state", ""), getattr(step, "kill_at", None)) for step in steps]
+        single = [(type(step), _kind(step), getattr(step, "kill_at", None)) for step in steps]
         new = {*single, *itertools.pairwise(killed)} - self._covered
         self._skipped = 0 if new else self._skipped + 1
         self._covered |= new
@@ -411,6 +440,13 @@ class _Search:
             sys.stderr.write("\n")
         seconds = round(time.monotonic() - self._began, 1)
         return ManagerCheck(self.scenarios, self._stage.kills, self._stage.loaded, seconds)
+
+
+def _kind(step: Step) -> object:
+    """Return in what a step differs from others of its class, other than by where it kills."""
+    if isinstance(step, LoadTogether):
+        return step.server, len({pickling.dumps(request) for request in step.requests})
+    return getattr(step, "state", "")
 
 
 def _to_terminal(line: str) -> None:

@@ -19,8 +19,9 @@ REFUSED = "a wrong request is refused"
 AGAIN = "a request that loads in a fresh manager always loads"
 RETURNS = "no callback but load and recover raises"
 LIVES = "the manager's process dies by the check alone"
+RACES = "callbacks that run at the same time do not race for an attribute"
 
-PROMISES = (ONCE, RECOVERED, LEFT, KEYS, LIMIT, REFUSED, AGAIN, RETURNS, LIVES)
+PROMISES = (ONCE, RECOVERED, LEFT, KEYS, LIMIT, REFUSED, AGAIN, RETURNS, LIVES, RACES)
 _MUST_RETURN = {role.name for role in (UNLOAD, STATUS, PAUSE, RESUME, USAGE)}
 _ENDS = ("end", "raised")
 
@@ -72,6 +73,8 @@ def faults_of_callbacks(notes: Sequence[Note]) -> Iterator[Fault]:
     for note in notes:
         if note.what == "blocked":
             yield Fault(LIMIT, f"the {note.role} callback of {note.name}: {_last(note)}\n{note.text}")
+        elif note.what == "race":
+            yield Fault(RACES, note.text)
         elif note.what == "changed":
             yield Fault(RECOVERED, f"the recover callback of {note.name}: {note.text}")
         elif note.what == "raised" and note.role in _MUST_RETURN:

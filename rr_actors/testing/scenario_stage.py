@@ -17,7 +17,7 @@ import tempfile
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -60,6 +60,7 @@ from rr_actors.testing.scenario_notes import (
     process_of,
     runs_in,
 )
+from rr_actors.testing.seen_manager import TOGETHER
 from rr_actors.testing.started_systems import LIMIT_S, VARIABLE, marked
 from rr_actors.testing.watched_manager import ARM, CENSUS, Watch, watched_class
 
@@ -178,7 +179,7 @@ class Stage:
                 fault = None
         elif census:
             self._learns = True
-            loads = {_key(step): step for step in steps if isinstance(step, s.Load)}
+            loads = {_key(load): load for step in steps for load in _loads(step)}
             for step in loads.values():
                 self._play([s.Load(step.server, step.request), s.Unload()])
             self._learns = False
@@ -222,6 +223,13 @@ def _left(left: Mapping[str, int]) -> Fault:
 
 def _key(step: s.Load) -> bytes:
     return pickling.dumps((step.server, step.request))
+
+
+def _loads(step: s.Step) -> list[s.Load]:
+    """Return the loads that a step makes."""
+    if isinstance(step, s.LoadTogether):
+        return [s.Load(step.server, request) for request in step.requests]
+    return [step] if isinstance(step, s.Load) else []
 
 
 def _modules(child: ChildSpec) -> list[str]:
@@ -328,6 +336,10 @@ class _Run:
                 self._load(step)
             case s.Wrong(server, request):
                 self._wrong(server, request)
+            case s.LoadTogether():
+                self._load_together(step)
+            case s.UnloadTogether():
+                self._unload_together()
             case s.Kill():
                 self._kill(step.kill_at)
             case s.AskUsage():
@@ -441,6 +453,52 @@ class _Run:
             return
         self.loaded += 1
         self._held.append(_Held(query, step))
+
+    def _load_together(self, step: s.LoadTogether) -> None:
+        loads = list({_key(load): load for load in _loads(step)}.values())
+        if self.servers[step.server].exclusive:
+            loads = loads[:1]
+        with self._meeting(step.role, len(loads)):
+            errors = self._at_once([functools.partial(self._load, load) for load in loads])
+        for error in errors:
+            raise error
+
+    def _unload_together(self) -> None:
+        held, self._held = self._held, []
+        resources = {one.query.resource_id for one in held}
+        with self._meeting("unload", len(resources)):
+            errors = self._at_once([functools.partial(self._unload, one, s.Unload()) for one in held])
+        for error in errors:
+            raise error
+
+    @contextlib.contextmanager
+    def _meeting(self, role: str, count: int) -> Generator[None]:
+        """Have the callbacks of a role wait for each other, so that they run at the same time."""
+        path = self._directory / TOGETHER
+        new = path.with_suffix(".new")
+        new.write_text(f"{role} {count} {uuid.uuid4().hex}")
+        new.rename(path)
+        try:
+            yield
+        finally:
+            path.unlink()
+
+    def _at_once(self, calls: Sequence[Callable[[], None]]) -> list[Exception]:
+        """Make calls in threads, and return what they raise."""
+        errors = list[Exception]()
+
+        def work(call: Callable[[], None]) -> None:
+            try:
+                call()
+            except Exception as error:
+                errors.append(error)
+
+        threads = [threading.Thread(target=work, args=(call,), name="check-manager", daemon=True) for call in calls]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        return errors
 
     def _take_refusal(self, step: s.Load, error: RrError) -> None:
         self.refusal = error

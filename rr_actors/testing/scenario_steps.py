@@ -40,6 +40,22 @@ class Unload(Step):
 
 
 @dataclass(frozen=True)
+class LoadTogether(Step):
+    """Several requests are loaded at the same time, and held: their load callbacks run at once."""
+
+    role: ClassVar[str] = "load"
+    server: str
+    requests: tuple[Any, ...]
+
+
+@dataclass(frozen=True)
+class UnloadTogether(Step):
+    """All that is held is released at the same time: the unload callbacks run at once."""
+
+    role: ClassVar[str] = "unload"
+
+
+@dataclass(frozen=True)
 class SendStatus(Step):
     """The manager hears a status of a resource of its own: OK, WARNING or ERROR."""
 
@@ -114,4 +130,18 @@ class Wrong(Step):
     request: Any
 
 
-STEPS = (Load, Unload, SendStatus, Fatal, Update, Reload, Pause, Resume, AskUsage, Kill, Wrong)
+STEPS = (
+    Load,
+    Unload,
+    LoadTogether,
+    UnloadTogether,
+    SendStatus,
+    Fatal,
+    Update,
+    Reload,
+    Pause,
+    Resume,
+    AskUsage,
+    Kill,
+    Wrong,
+)

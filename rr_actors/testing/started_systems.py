@@ -7,14 +7,18 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeVar, cast
 
 from rr_actors.base.config import SystemConfig
 from rr_actors.base.steps import Steps
+from rr_actors.registrar.manager import Manager
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor
 from rr_actors.system.registrar_lookup import left_behind
 from rr_actors.system.system import System
+from rr_actors.testing.callback_notes import NoteReader
+from rr_actors.testing.seen_manager import seen_class
 
 LIMIT_S = 5.0
 """How long the processes and threads of a stopped system may take to end."""
@@ -69,17 +73,21 @@ class _Left(NamedTuple):
         ]
 
 
-def started_systems(place: Path, setenv: Callable[[str, str], None]) -> Generator[StartSystem, None, list[str]]:
-    """Yield what starts systems for a test. Then stop them, and return a line for each thing that is left behind.
+def started_systems(
+    place: Path, setenv: Callable[[str, str], None], *, races: bool = False
+) -> Generator[StartSystem, None, list[str]]:
+    """Yield what starts systems for a test. Then stop them, and return what is wrong: what is left, and what races.
 
     Args:
         place: the directory for their state directories.
         setenv: gives an environment variable a value until the test ends.
+        races: whether managers are seen through the race lens.
     """
     mark = uuid.uuid4().hex
     setenv(VARIABLE, mark)
     before = _look(mark)
     systems: list[System] = []
+    notes = place / "rr_races"
 
     def start(
         *children: ChildSpec | Supervisor | Sequence[ChildSpec | Supervisor],
@@ -94,6 +102,9 @@ def started_systems(place: Path, setenv: Callable[[str, str], None]) -> Generato
         first = children[0] if len(children) == 1 else None
         specs = [child for child in children if isinstance(child, ChildSpec | Supervisor)]
         root = specs if first is None or isinstance(first, ChildSpec) else first
+        if races:
+            notes.mkdir(exist_ok=True)
+            root = _seen(root, str(notes))
         system = System(root, name=name, state_dir=state_dir, config=config, debug=debug)
         systems.append(system)
         return system.start()
@@ -109,7 +120,35 @@ def started_systems(place: Path, setenv: Callable[[str, str], None]) -> Generato
     for system in systems:
         found = left_behind(system.config, system.state_dir, set()) if system.state_dir.is_dir() else {}
         left += [f"registrar {name} of {system.state_dir}: {contents}" for name, contents in found.items()]
-    return left
+    wrong = [f"left behind: {'; '.join(left)}"] if left else []
+    if notes.is_dir():
+        wrong += [f"callbacks race for {race}" for race in _races(notes)]
+    return wrong
+
+
+T = TypeVar("T")
+
+
+def _seen(children: T, notes: str) -> T:
+    """Return children whose managers are seen through the race lens."""
+    seen: Any = children
+    if isinstance(children, ChildSpec):
+        cls: object = children.actor_class_or_manager
+        if isinstance(cls, type) and issubclass(cls, Manager):
+            seen = replace(children, actor_class_or_manager=seen_class(cls, notes))
+    elif isinstance(children, Supervisor):
+        seen = replace(children, children=_seen(children.children, notes))
+    elif isinstance(children, list | tuple):
+        seen = [_seen(child, notes) for child in cast("Sequence[object]", children)]
+    return seen
+
+
+def _races(notes: Path) -> list[str]:
+    reader = NoteReader(notes)
+    try:
+        return sorted({note.text for note in reader.read() if note.what == "race"})
+    finally:
+        reader.close()
 
 
 def _still_left(mark: str, before: _Left) -> list[str]:

@@ -30,6 +30,7 @@ from rr_actors.registrar.model.roles import LOAD, RECOVER, ROLES, UPGRADE, Role
 from rr_actors.registrar.servers.callback_context import current_or_none
 from rr_actors.runtime.workers import is_async
 from rr_actors.testing.callback_notes import Note, begin_notes
+from rr_actors.testing.seen_manager import SeenManager
 
 ARM, CENSUS = "arm", "census"
 """Files of the directory: which callback dies next, as "server role line"; and what is asked of a process, its id."""
@@ -52,7 +53,7 @@ class Watch(msgspec.Struct, frozen=True):
     same: Callable[[Any, Any], bool]
 
 
-class WatchedManager(Manager):
+class WatchedManager(SeenManager):
     """The base of the class that check_manager() makes of the user's class, which is its second base."""
 
     _watch: ClassVar[Watch]
@@ -63,7 +64,12 @@ class WatchedManager(Manager):
 
 def watched_class(cls: type[Manager], watch: Watch) -> type[Manager]:
     """Return a subclass of a class of managers whose callbacks are noted. It travels by value."""
-    names = {"_watch": watch, "__module__": __name__, "__qualname__": f"watched.{cls.__qualname__}"}
+    names = {
+        "_watch": watch,
+        "_notes": watch.directory,
+        "__module__": __name__,
+        "__qualname__": f"watched.{cls.__qualname__}",
+    }
     return type(cls)(cls.__name__, (WatchedManager, cls), names)
 
 

@@ -20,6 +20,7 @@ from rr_actors.testing import (
     Fatal,
     Kill,
     Load,
+    LoadTogether,
     ManagerFault,
     Pause,
     Reload,
@@ -27,6 +28,7 @@ from rr_actors.testing import (
     SendStatus,
     Step,
     Unload,
+    UnloadTogether,
     Update,
     Wrong,
     check_manager,
@@ -66,6 +68,13 @@ def kinds(fault: ManagerFault) -> list[type[Step]]:
             planted.SharesAKey, "two resources of one request do not share a key", [Load, Fatal], marks=pytest.mark.slow
         ),
         pytest.param(planted.Blocks, "no callback takes longer than its limit", [Load, Kill], marks=pytest.mark.slow),
+        (planted.CountsByItself, "callbacks that run at the same time do not race for an attribute", [LoadTogether]),
+        pytest.param(
+            planted.OpensTwice,
+            "callbacks that run at the same time do not race for an attribute",
+            [LoadTogether],
+            marks=pytest.mark.slow,
+        ),
         (planted.TakesAnything, "a wrong request is refused", [Wrong]),
         pytest.param(
             planted.FailsAfterACrash,
@@ -104,12 +113,14 @@ def test_a_planted_fault_is_found_and_shrunk(manager: type[rr.Manager], promise:
     [
         (planted.Ports, DEVICES),
         (planted.Supplies, DEVICES),
+        (planted.CountsWithALock, DEVICES),
+        (planted.CountsSerially, DEVICES),
         (
             rr.ChildSpec(planted.Lamps, id="lamps"),
             {"lamp": st.builds(dict, room=DEVICES, bright=st.booleans()), "scene": DEVICES},
         ),
     ],
-    ids=["ports", "supplies", "lamps"],
+    ids=["ports", "supplies", "lock", "serial", "lamps"],
 )
 @pytest.mark.timeout(120)
 def test_a_good_manager_passes(manager: Any, requests: Any) -> None:
@@ -142,6 +153,8 @@ def test_each_step_runs_its_callback_and_may_kill_in_it() -> None:
             Wrong("scene", 3),
             Unload(0),
             Unload(0, kill_at=0),
+            LoadTogether("lamp", (lamp, {"room": "attic"}, {"room": "attic"})),
+            UnloadTogether(),
         ],
     )
 

@@ -23,10 +23,12 @@ class Lamps(rr.Manager):
 """
 
 
-def run(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, test: str) -> pytest.RunResult:
+def run(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, test: str, *options: str) -> pytest.RunResult:
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, (str(REPOSITORY), os.environ.get("PYTHONPATH")))))
     pytester.makepyfile(HEAD + test)
-    return pytester.runpytest_subprocess("-p", "no:cacheprovider", "-p", "no:rerunfailures")  # that has a thread
+    return pytester.runpytest_subprocess(
+        "-p", "no:cacheprovider", "-p", "no:rerunfailures", *options
+    )  # that has a thread
 
 
 def test_a_test_gets_a_system_that_is_stopped_after_it(
@@ -156,3 +158,63 @@ def test_nobody(rr_system):
     assert "rr_actors/" not in shown.partition("FAILURES")[2]
     monkeypatch.setenv("PYTEST_ADDOPTS", "--full-trace")
     assert "rr_actors/registrar/registrar.py" in run(pytester, monkeypatch, test).stdout.str()
+
+
+COUNTERS = """
+class Counters(rr.Manager):
+    def __init__(self):
+        self.count = 0
+        self.meeting = threading.Barrier(2)
+
+    @rr.server("counter")
+    def count_one(self, name: str) -> str:
+        self.meeting.wait(30)  # both load callbacks run now
+        self.count += 1
+        self.meeting.wait(30)
+        return name
+
+@pytest.mark.parametrize("placement", ["thread", "process"])
+def test_counters(rr_system, placement):
+    system = rr_system(rr.Supervisor([rr.ChildSpec(Counters, id="counters", placement=placement)]))
+    with system.open_registrar("app").load_all([(Counters.count_one, "a"), (Counters.count_one, "b")]):
+        pass
+
+def test_a_lock(rr_system):
+    class Locked(rr.Manager):
+        def __init__(self):
+            self.count = 0
+            self.lock = threading.Lock()
+            self.meeting = threading.Barrier(2)
+
+        @rr.server("counter")
+        def count_one(self, name: str) -> str:
+            self.meeting.wait(30)
+            with self.lock:
+                self.count += 1
+            self.meeting.wait(30)
+            return name
+
+    system = rr_system(rr.ChildSpec(Locked, id="counters"))
+    with system.open_registrar("app").load_all([("counters/counter", "a"), ("counters/counter", "b")]):
+        pass
+"""
+
+
+def test_a_race_is_shown_with_both_places(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
+    result = run(pytester, monkeypatch, "import pytest\n" + COUNTERS, "--rr-races")
+
+    result.assert_outcomes(passed=3, errors=2)
+    result.stdout.fnmatch_lines(
+        [
+            "rr_system: callbacks race for self.count",
+            '*the load callback of counters/counter "*" wrote it',
+            "*in Counters.count_one: self.count += 1",
+            '*the load callback of counters/counter "*" read it',
+            "*in Counters.count_one: self.count += 1",
+            "serial=True of the class, at_once=1 of a server, or a lock mends it",
+        ]
+    )
+
+
+def test_without_the_option_nothing_is_seen(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> None:
+    run(pytester, monkeypatch, "import pytest\n" + COUNTERS).assert_outcomes(passed=3)
