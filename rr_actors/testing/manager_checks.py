@@ -151,9 +151,9 @@ def check_manager(
     serial = cast("type[Manager]", setup.child.actor_class_or_manager).serial
     with _quiet(), Stage(setup) as stage:
         search = _Search(stage, setup, kills, time.monotonic() + limit_s, progress)
+        scenarios = _scenarios(strategies, refused, stage.servers, with_kills=kills > 0, serial=serial)
         if not serial:
             search.run(_together(strategies), seed, _MEETINGS, only=RACES)
-        scenarios = _scenarios(strategies, refused, stage.servers, with_kills=kills > 0, serial=serial)
         search.run(scenarios, seed, _PER_KILL * kills or _SCENARIOS_WITHOUT_KILLS)
         return search.result()
 
