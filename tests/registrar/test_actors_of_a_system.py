@@ -12,10 +12,8 @@ import pykka
 import pytest
 
 import rr_actors as rr
-from rr_actors.actors.messaging.mailbox import Mailbox
 from rr_actors.actors.turns import AT_ONCE, TurnActor
 from support import REPOSITORY, eventually
-from support_inside import actor_of
 
 LIMIT_S = 20.0
 PAGE = REPOSITORY / "docs" / "life-of-a-load.md"
@@ -64,23 +62,6 @@ def delivered(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
 
         monkeypatch.setattr(TurnActor, name, noted)
     return found
-
-
-def test_each_registrar_client_and_server_is_an_actor_with_a_mailbox(app: rr.Registrar) -> None:
-    app.register_server("thing", lambda request: request)
-    app.load("cameras/camera", "front")
-    app.load("app/thing", "x")
-    registrar = actor_of(app)
-    server = registrar.servers.get("thing")
-    assert server is not None
-    actors: dict[str, TurnActor] = {"app": registrar, "app/servers/thing": server}
-    actors |= {f"app/clients/{provider}": client for provider, client in registrar.clients.items()}
-    for path, actor in actors.items():
-        assert isinstance(actor, pykka.Actor)
-        assert isinstance(actor.actor_inbox, Mailbox)
-        assert len(actor.actor_inbox) == 0
-        assert actor.actor_ref.path == path
-        assert actor.actor_ref.is_alive()
 
 
 def test_a_server_ends_when_it_is_unregistered(system: rr.System, app: rr.Registrar) -> None:
