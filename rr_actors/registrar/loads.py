@@ -304,9 +304,10 @@ def answered(actor: RegistrarActor, client: ProviderLink, message: Message) -> A
 
     Record both if there is a recording.
     """
+    at = time.time() if actor.node.watched.level[0] > 1 else None
     answer = client.answer_at_once(message)
-    if answer is not None and actor.node.watched.level[0] > 1:
-        actor.recorder.message("sent", actor.name, client.provider, message)
+    if answer is not None and at is not None:
+        actor.recorder.message("sent", actor.name, client.provider, message, at)
         actor.recorder.message("received", actor.name, client.provider, answer)
     return answer
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 import threading
 from collections.abc import Callable, Iterator
@@ -182,6 +183,71 @@ def test_a_thread_that_joins_takes_the_turn_and_puts_nothing_into_a_mailbox(
     caller.join(LIMIT_S)
     assert query[0].response == "x"
     assert delivered == []
+
+
+# -- recordings of both ways -------------------------------------------------------------------------------------------
+
+FIRST = ["app>{0} Load", "{0} has Load", "{0} began load", "{0} ended load", "{0}>app Loaded", "app has Loaded"]
+JOINED = ["app>{0} Load", "{0} has Load", "{0}>app Loaded", "app has Loaded"]
+LEFT = ["app>{0} Unload", "{0} has Unload", "{0}>app Unloaded", "app has Unloaded"]
+LOADS: dict[str, Callable[[rr.Registrar, str, str], rr.Query[Any]]] = {
+    "over the loop": lambda app, server, request: app.load(server, request, block=False).get(timeout=LIMIT_S),
+    "by a thread's turn": lambda app, server, request: app.load(server, request),
+    "by a task's turn": lambda app, server, request: asyncio.run(_awaited(app, server, request)),
+}
+UNLOADS: dict[str, Callable[[rr.Registrar, rr.Query[Any]], object]] = {
+    "over the loop": lambda app, query: app.unload(query, block=False).get(timeout=LIMIT_S),
+    "by a thread's turn": lambda app, query: app.unload(query),
+    "by a task's turn": lambda app, query: asyncio.run(app.unload_async(query)),
+}
+
+
+async def _awaited(app: rr.Registrar, server: str, request: str) -> rr.Query[Any]:
+    return await app.load_async(server, request)
+
+
+def lines_of(recording: rr.Recording, query: str) -> list[str]:
+    """What a recording has of the messages of a query, in its order, and of the callbacks meanwhile."""
+    lines: list[str] = []
+    for entry in recording.entries():
+        if entry.query == query and entry.event == "sent":
+            lines.append(f"{entry.registrar}>{entry.peer} {entry.name}")
+        elif entry.query == query and entry.event == "received":
+            lines.append(f"{entry.registrar} has {entry.name}")
+        elif entry.event in ("began", "ended"):
+            lines.append(f"{entry.registrar} {entry.event} {entry.name}")
+    return lines
+
+
+@pytest.mark.parametrize("way", LOADS)
+@pytest.mark.parametrize("provider", ["near", "cameras"])
+def test_a_recording_has_the_same_of_a_load_whoever_takes_the_turn(
+    system: rr.System, app: rr.Registrar, delivered: list[tuple[str, str]], provider: str, way: str
+) -> None:
+    near = system.open_registrar("near")
+    near.register_server("camera", lambda request: request)
+    load, unload, server = LOADS[way], UNLOADS[way], f"{provider}/camera"
+    for _ in range(3):  # the first loads of a thread and a task make their connections
+        load(app, server, "warm")
+
+    def recorded(call: Callable[[], rr.Query[Any]], *expected: str) -> None:
+        wanted = [line.format(provider) for line in expected]
+        with system.record() as recording:
+            query = call()
+            eventually(lambda: len(lines_of(recording, query.id)) >= len(wanted), what=f"all of {wanted}")
+        assert lines_of(recording, query.id) == wanted
+
+    def join_and_leave() -> rr.Query[Any]:
+        query = load(app, server, "x")
+        unload(app, query)
+        return query
+
+    recorded(lambda: load(app, server, "x"), *FIRST)
+    del delivered[:]
+    recorded(join_and_leave, *JOINED, *LEFT)
+    taken = [message for actor, message in delivered if actor == "near"]
+    by_mailbox = provider == "near" and way == "over the loop"
+    assert ("Load" in taken) == by_mailbox  # an Unload is put into it also behind what the loop has not done yet
 
 
 @pytest.mark.parametrize("ways", ["over the loop", "by the turn of the sender", "by both"])
