@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import random
 import re
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Coroutine, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -250,30 +252,106 @@ def test_a_recording_has_the_same_of_a_load_whoever_takes_the_turn(
     assert ("Load" in taken) == by_mailbox  # an Unload is put into it also behind what the loop has not done yet
 
 
-@pytest.mark.parametrize("ways", ["over the loop", "by the turn of the sender", "by both"])
-def test_the_messages_of_one_sender_keep_their_order_over_both_ways(
-    system: rr.System, app: rr.Registrar, ways: str
+# -- the order of one sender's messages --------------------------------------------------------------------------------
+
+
+class Shelf(rr.Manager):
+    """Notes the callbacks of its server in their order: "x" loads, "-x" unloads."""
+
+    def __init__(self) -> None:
+        self.order: list[str] = []
+
+    @rr.server("thing", at_once=1)
+    def thing(self, request: str) -> str:
+        self.order.append(request)
+        return request
+
+    @thing.unload
+    def unload_thing(self, request: str, response: str) -> None:
+        self.order.append(f"-{request}")
+
+    def on_receive(self, message: Any) -> list[str]:
+        return self.order
+
+
+async def mixed(app: rr.Registrar, wait: Waits, seed: int) -> list[str]:
+    """Load and unload at random, waiting for some calls while others are in flight; return what was asked for."""
+    choose = random.Random(seed)
+    asked: list[str] = []
+    held: list[rr.Query[Any]] = []
+    for turn in range(25):
+        loads: list[Any] = []
+        unloads: list[Any] = []
+        for number in range(choose.randrange(1, 6)):
+            if held and choose.random() < 0.4:
+                query = held.pop(choose.randrange(len(held)))
+                asked.append(f"-{query.response}")
+                unloads.append(app.unload(query, block=False))
+            else:
+                asked.append(f"{seed}.{turn}.{number}")
+                loads.append(app.load("shelf/thing", asked[-1], block=False))
+        if held and turn % 3 == 0:
+            query = held.pop()
+            asked.append(f"-{query.response}")
+            await wait.unload(app, query)
+        else:
+            asked.append(f"{seed}.{turn}.last")
+            held.append(await wait.load(app, asked[-1]))
+        held += [one.get(timeout=LIMIT_S) for one in loads]
+        for one in unloads:
+            one.get(timeout=LIMIT_S)
+    return asked
+
+
+class InThread:
+    """The blocking calls of a thread."""
+
+    async def load(self, app: rr.Registrar, request: str) -> rr.Query[Any]:
+        return app.load("shelf/thing", request)
+
+    async def unload(self, app: rr.Registrar, query: rr.Query[Any]) -> None:
+        app.unload(query)
+
+    def run(self, program: Coroutine[Any, Any, list[str]]) -> list[str]:
+        """Run the program, which awaits nothing, in a thread without an event loop."""
+
+        def steps() -> list[str]:
+            try:
+                program.send(None)
+            except StopIteration as end:
+                return end.value
+            raise AssertionError("it has awaited something")
+
+        with ThreadPoolExecutor(1) as threads:
+            return threads.submit(steps).result(LIMIT_S * 3)
+
+
+class InTask:
+    """The awaited calls of a task."""
+
+    async def load(self, app: rr.Registrar, request: str) -> rr.Query[Any]:
+        return await app.load_async("shelf/thing", request)
+
+    async def unload(self, app: rr.Registrar, query: rr.Query[Any]) -> None:
+        await app.unload_async(query)
+
+    def run(self, program: Coroutine[Any, Any, list[str]]) -> list[str]:
+        """Run the program as a task of an event loop."""
+        return asyncio.run(program)
+
+
+Waits = InThread | InTask
+
+
+@pytest.mark.parametrize("wait", [InThread(), InTask()], ids=["a thread", "a task"])
+@pytest.mark.parametrize("placement", ["process", "thread"])
+def test_the_messages_of_one_sender_keep_their_order_over_both_ways_with_others_in_flight(
+    start: Callable[..., rr.System], placement: Any, wait: Waits
 ) -> None:
-    near = system.open_registrar("near")
-    order: list[str] = []
-    near.register_server(
-        "thing", lambda request: order.append(request) or request, unload=lambda request, _: order.append(request)
-    )
-    block: dict[str, Callable[[int], bool]] = {
-        "over the loop": lambda _: False,
-        "by the turn of the sender": lambda _: True,
-        "by both": lambda turn: turn % 2 == 0,
-    }
-    expected: list[str] = []
-    for turn in range(20):
-        name = f"thing {turn}"
-        waits = block[ways](turn)
-        query = (
-            app.load("near/thing", name) if waits else app.load("near/thing", name, block=False).get(timeout=LIMIT_S)
-        )
-        query.unload() if not waits else app.unload(query)
-        expected += [name, name]
-    assert order == expected
+    system = start(rr.ChildSpec(Shelf, id="shelf", placement=placement))
+    app = system.open_registrar("app")
+    asked = [one for seed in (1, 2) for one in wait.run(mixed(app, wait, seed))]
+    assert system.ref("shelf").ask("order") == asked
 
 
 def test_all_requests_are_sent_also_if_there_are_more_than_share_a_turn(system: rr.System, app: rr.Registrar) -> None:
