@@ -60,7 +60,7 @@ def in_step(scale: int, times: int) -> list[Row]:
         *_beside_one("thread", 10 * scale, times),
         *_beside_one("process", 4 * scale, times),
         *_rows("parts of a resource", (few, some, many), times, _on_one_core(_parts)),
-        *_rows("clients", dear, times, _clients),
+        *_rows("connections", dear, times, _connections),
         *_rows("resources", (some, many, 3 * many), times, _inspected),
     ]
 
@@ -110,7 +110,7 @@ def _system(*children: rr.ChildSpec) -> Iterator[tuple[rr.System, _Clock]]:
     with tempfile.TemporaryDirectory(prefix="rr-bench-") as state_dir:
         root = rr.Supervisor(children, max_restarts=1_000_000)
         clock = _Clock()
-        system = rr.System(root, state_dir=state_dir, config=rr.SystemConfig(clients_limit=1_000))
+        system = rr.System(root, state_dir=state_dir, config=rr.SystemConfig(connections_limit=1_000))
         with system:
             yield system, clock
 
@@ -302,14 +302,14 @@ def _parts(count: int) -> Seconds:
     return clock.taken
 
 
-def _clients(count: int) -> Seconds:
+def _connections(count: int) -> Seconds:
     with _system() as (system, _), ExitStack() as stack:
         provider = system.open_registrar("provider")
         provider.register_server("thing", lambda request: request, _nothing)
         clock = _Clock()
         for number in range(count):
-            client = stack.enter_context(rr.connect(system.state_dir))
-            client.open_registrar(f"worker{number}").load("provider/thing", "one for all")
+            connection = stack.enter_context(rr.connect(system.state_dir))
+            connection.open_registrar(f"worker{number}").load("provider/thing", "one for all")
         clock.step("connection and a load")
     return clock.taken
 

@@ -3,8 +3,6 @@
 python examples/bounded_buffer.py
 """
 
-from __future__ import annotations
-
 import tempfile
 from typing import Any
 
@@ -12,48 +10,37 @@ import rr_actors as rr
 
 
 class Buffer(rr.Actor):
-    def __init__(self, size: int) -> None:
-        self.size, self.items, self.puts, self.takes = size, list[Any](), list[Any](), list[Any]()
+    def __init__(self) -> None:
+        self.items, self.puts, self.takes = list[Any](), list[Any](), list[Any]()
 
     def on_receive(self, message: Any) -> None:
         (self.takes if message[0] == "take" else self.puts).append(message[1:])
-        while self.items or self.puts:
-            while self.puts and len(self.items) < self.size:
-                producer, item = self.puts.pop(0)
-                self.items.append(item)
+        while (has_room := self.puts and len(self.items) < 2) or (self.takes and self.items):
+            if has_room:
+                self.items.append(self.puts[0][1])
                 print("has", self.items)
-                producer.tell(self.actor_ref)
-            if not self.takes:
-                return
-            self.takes.pop(0)[0].tell((self.actor_ref, self.items.pop(0)))
+                self.puts.pop(0)[0].tell(self.actor_ref)
+            else:
+                self.takes.pop(0)[0].tell((self.actor_ref, self.items.pop(0)))
 
 
 class Producer(rr.Actor):
-    left = 5
+    left = iter((4, 3, 2, 1, 0))
 
     def on_receive(self, message: Any) -> None:
-        if self.left:  # the message is the buffer, which has room
-            self.left -= 1
-            message.tell(("put", self.actor_ref, self.left))
+        if (item := next(self.left, None)) is not None:  # the message is the buffer, which has room
+            message.tell(("put", self.actor_ref, item))
 
 
 class Consumer(rr.Actor):
     def on_receive(self, message: Any) -> None:
-        buffer, item = message
-        print("takes", item)
-        buffer.tell(("take", self.actor_ref)) if item else self.stop()
-
-
-def main() -> None:
-    actors = [(Buffer, (2,)), (Producer, ()), (Consumer, ())]
-    children = [rr.ChildSpec(cls, args=args, placement="thread", restart="transient") for cls, args in actors]
-    with tempfile.TemporaryDirectory() as state, rr.System(children, state_dir=state) as system:
-        buffer, consumer = system.ref("Buffer"), system.ref("Consumer")
-        ended = rr.monitor(consumer)
-        system.ref("Producer").tell(buffer)
-        buffer.tell(("take", consumer))
-        ended.wait(10)
+        print("takes", message[1])
+        message[0].tell(("take", self.actor_ref)) if message[1] else self.stop()
 
 
 if __name__ == "__main__":
-    main()
+    children = [rr.ChildSpec(kind, placement="thread", restart="transient") for kind in (Buffer, Producer, Consumer)]
+    with tempfile.TemporaryDirectory() as state, rr.System(children, state_dir=state) as system:
+        system.ref("Producer").tell(system.ref("Buffer"))
+        system.ref("Buffer").tell(("take", system.ref("Consumer")))
+        rr.monitor(system.ref("Consumer")).wait(10)

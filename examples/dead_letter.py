@@ -3,8 +3,6 @@
 python examples/dead_letter.py
 """
 
-from __future__ import annotations
-
 import tempfile
 
 import rr_actors as rr

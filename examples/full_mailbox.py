@@ -5,8 +5,6 @@ An ask instead of a tell has the sender wait for each answer: it cannot be faste
 python examples/full_mailbox.py
 """
 
-from __future__ import annotations
-
 import tempfile
 import threading
 import time

@@ -6,12 +6,9 @@ fork with the lower number first, no ring is possible.
 python examples/philosophers.py
 """
 
-from __future__ import annotations
-
 import logging
 import tempfile
 import threading
-from collections.abc import Callable
 from typing import Any
 
 import rr_actors as rr
@@ -20,24 +17,21 @@ N = 3
 
 
 class Fork(rr.Actor):
-    def on_receive(self, message: Any) -> str:
-        who, others, all_have_one = message
-        if not others:
-            return f"philosopher {who} eats"
+    def on_receive(self, message: Any) -> Any:
+        other, all_have_one = message
+        if other is None:
+            return "eaten"
         all_have_one()
-        answer: str = others[0].ask((who, others[1:], all_have_one))
-        return answer
+        return other.ask((None, all_have_one))
 
 
-def dine(forks: list[rr.ActorRef[Any]], orders: list[list[int]], all_have_one: Callable[[], object]) -> None:
-    meals: list[Any] = []
-    for who, (first, second) in enumerate(orders):
-        meals.append(forks[first].ask((who, [forks[second]], all_have_one), block=False))
-    errors = [error for meal in meals if (error := meal.exception()) is not None]
-    eaten = len(meals) - len(errors)
+def dine(title: str, forks: list[rr.ActorRef[Any]], orders: list[list[int]], all_have_one: Any) -> None:
+    print(title)
+    meals = [forks[first].ask((forks[second], all_have_one), block=False) for first, second in orders]
+    errors: list[Any] = [error for meal in meals if (error := meal.exception()) is not None]
     for error in errors:
         print(f"  refused: a ring of {len(error.ring) - 1} forks")
-    print(f"  {eaten} of {len(meals)} have eaten")
+    print(f"  {N - len(errors)} of {N} have eaten")
 
 
 def main() -> None:
@@ -45,11 +39,9 @@ def main() -> None:
     children = [rr.ChildSpec(Fork, id=f"fork{number}", placement="thread") for number in range(N)]
     with tempfile.TemporaryDirectory() as state, rr.System(children, state_dir=state) as system:
         forks = [system.ref(f"fork{number}") for number in range(N)]
-        left_first = [[who, (who + 1) % N] for who in range(N)]
-        print("each takes the left fork first")
-        dine(forks, left_first, threading.Barrier(N).wait)
-        print("each takes the fork with the lower number first")
-        dine(forks, [sorted(order) for order in left_first], lambda: None)
+        orders = [[who, (who + 1) % N] for who in range(N)]
+        dine("each takes the left fork first", forks, orders, threading.Barrier(N).wait)
+        dine("each takes the fork with the lower number first", forks, [sorted(it) for it in orders], lambda: None)
 
 
 if __name__ == "__main__":

@@ -3,8 +3,6 @@
 python examples/ping_pong.py
 """
 
-from __future__ import annotations
-
 import tempfile
 from typing import Any
 

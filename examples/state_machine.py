@@ -1,46 +1,35 @@
-"""A state machine: an actor whose state is the method that handles the next message. What a state does not know fails.
+"""A state machine: an actor whose state is the method that handles the next message. What it does not know fails.
 
 python examples/state_machine.py
 """
 
-from __future__ import annotations
-
 import logging
 import tempfile
-from collections.abc import Callable
 
 import rr_actors as rr
 
 
 class Turnstile(rr.Actor):
     def __init__(self) -> None:
-        self.coins = 0
-        self.state: Callable[[str], str] = self.locked
+        self.coins, self.state = 0, self.locked
 
     def on_receive(self, message: str) -> str:
+        if message not in ("coin", "push"):
+            raise ValueError(f"{self.state.__name__}: expected coin or push, got {message}")
         return self.state(message)
 
     def locked(self, message: str) -> str:
-        match message:
-            case "coin":
-                self.coins += 1
-                self.state = self.unlocked
-                return "unlocks"
-            case "push":
-                return "stays locked"
-            case _:
-                raise ValueError(f"locked: expected coin or push, got {message}")
+        if message == "push":
+            return "stays locked"
+        self.coins, self.state = self.coins + 1, self.unlocked
+        return "unlocks"
 
     def unlocked(self, message: str) -> str:
-        match message:
-            case "push":
-                self.state = self.locked
-                return f"lets one through, and locks after {self.coins} coins"
-            case "coin":
-                self.coins += 1
-                return "keeps the coin"
-            case _:
-                raise ValueError(f"unlocked: expected coin or push, got {message}")
+        if message == "push":
+            self.state = self.locked
+            return f"lets one through, and locks after {self.coins} coins"
+        self.coins += 1
+        return "keeps the coin"
 
 
 def main() -> None:
@@ -48,10 +37,8 @@ def main() -> None:
     children = [rr.ChildSpec(Turnstile, id="turnstile", placement="thread")]
     with tempfile.TemporaryDirectory() as state, rr.System(children, state_dir=state) as system:
         for message in ("push", "coin", "coin", "kick", "push", "push"):
-            try:
-                print(f"{message}: {system.ref('turnstile').ask(message)}")
-            except ValueError as error:
-                print(f"{message}: {error}")
+            answer = system.ref("turnstile").ask(message, block=False)
+            print(f"{message}: {answer.exception() or answer.get()}")
 
 
 if __name__ == "__main__":

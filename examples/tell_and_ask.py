@@ -5,11 +5,8 @@ An error in a handler that was told ends the actor, and its supervisor starts it
 python examples/tell_and_ask.py
 """
 
-from __future__ import annotations
-
 import logging
 import tempfile
-import threading
 
 import rr_actors as rr
 
@@ -26,22 +23,19 @@ class Counter(rr.Actor):
 
 def main() -> None:
     logging.getLogger("rr_actors").setLevel(logging.CRITICAL)  # the errors are what this shows
-    back = threading.Event()
     children = [rr.ChildSpec(Counter, id="counter", placement="thread")]
     with tempfile.TemporaryDirectory() as state, rr.System(children, state_dir=state) as system:
-        system.subscribe(lambda event: back.set() if event["event"] == "restarted" else None)
         counter = system.ref("counter")
         for _ in range(3):
             counter.tell(10)
         print("told three times, then asked:", counter.ask(0))
-        try:
-            counter.ask(-1)
-        except ValueError as error:
-            print("asked, and heard the error:", error)
+        print("asked, and heard the error:", counter.ask(-1, block=False).exception())
         print("the actor lives, and has:", counter.ask(0))
+        ended = rr.monitor(counter)
         counter.tell(-1)
         print("told, and heard nothing")
-        back.wait(10)
+        ended.wait(10)
+        counter.wait_running()
         print("the actor is another one, and has:", counter.ask(0))
 
 

@@ -3,8 +3,6 @@
 python examples/token_ring.py
 """
 
-from __future__ import annotations
-
 import tempfile
 from typing import Any
 
@@ -23,10 +21,7 @@ class Node(rr.Actor):
                 self.next = node
             case "token", hops:
                 self.turns += 1  # here it may use the shared thing
-                if hops:
-                    self.next.tell(("token", hops - 1))
-                else:
-                    self.next.tell("the end")
+                self.next.tell(("token", hops - 1) if hops else "the end")
             case _:
                 self.stop()
         return None

@@ -1,4 +1,4 @@
-"""A console's socket: what clients say, as frames of requests, and what a client takes for answers."""
+"""A console's socket: what connections say, as frames of requests, and what a connection takes for answers."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _feed(data: bytes) -> None:
 
 
 CONSOLE = Target(
-    "what clients of a console say, and what a client is answered",
+    "what connections of a console say, and what a connection is answered",
     lambda directory: _feed,
     _seeds,
     in_frames(2),

@@ -103,8 +103,8 @@ if TYPE_CHECKING or getattr(_sys, "frozen", False):
         from rr_actors.supervision.core.rendering import Tree, render
         from rr_actors.supervision.core.specs import Backoff, ChildModel, ChildSpec, Exponential, Supervisor, Uniform
         from rr_actors.supervision.supervisor import Child, Counts, SupervisorRef
-        from rr_actors.system.console.asking.client_proxies import ClientProxy
-        from rr_actors.system.console.connected_client import Client, ClientQuery, ClientRegistrar, connect
+        from rr_actors.system.console.asking.connected_proxies import ConnectedProxy
+        from rr_actors.system.console.connection import ConnectedQuery, ConnectedRegistrar, Connection, connect
         from rr_actors.system.event_subscribers import (
             ChildEvent,
             DeadLetterEvent,
@@ -154,11 +154,11 @@ __all__ = [
     "ChildRunning",
     "ChildSpec",
     "CircularDependency",
-    "Client",
-    "ClientProxy",
-    "ClientQuery",
-    "ClientRegistrar",
     "ConfigError",
+    "ConnectedProxy",
+    "ConnectedQuery",
+    "ConnectedRegistrar",
+    "Connection",
     "Counts",
     "Current",
     "DeadLetter",
@@ -302,8 +302,8 @@ if not TYPE_CHECKING:
         "rr_actors.supervision.core.rendering": "Tree render",
         "rr_actors.supervision.core.specs": "Backoff ChildModel ChildSpec Exponential Supervisor Uniform",
         "rr_actors.supervision.supervisor": "Child Counts SupervisorRef",
-        "rr_actors.system.console.asking.client_proxies": "ClientProxy",
-        "rr_actors.system.console.connected_client": "Client ClientQuery ClientRegistrar connect",
+        "rr_actors.system.console.asking.connected_proxies": "ConnectedProxy",
+        "rr_actors.system.console.connection": "Connection ConnectedQuery ConnectedRegistrar connect",
         "rr_actors.system.event_subscribers": (
             "ChildEvent DeadLetterEvent EndedEvent Event MissedEvent ProgressEvent ResourceEvent StreamEvent"
         ),

@@ -38,10 +38,10 @@ class Models(rr.Manager):
 
 @asynccontextmanager
 async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-    with rr.connect("rr_state") as client:
-        registrar = client.open_registrar(f"web-{os.getpid()}")
+    with rr.connect("rr_state") as connection:
+        registrar = connection.open_registrar(f"web-{os.getpid()}")
         async with await registrar.load_async("models/model", "words") as model:  # all workers hold the same one
-            app.state.client, app.state.model = client, model.resource_id
+            app.state.connection, app.state.model = connection, model.resource_id
             yield
 
 
@@ -51,7 +51,7 @@ app = FastAPI(lifespan=lifespan)
 @app.get("/numbers/{word}")
 def number(word: str, request: Request) -> dict[str, Any]:
     state = request.app.state
-    return state.client.ask("models", {"model": state.model, "word": word}) | {"worker": os.getpid()}
+    return state.connection.ask("models", {"model": state.model, "word": word}) | {"worker": os.getpid()}
 
 
 @app.exception_handler(rr.Unavailable)

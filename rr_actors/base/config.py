@@ -125,7 +125,7 @@ class SystemConfig:
             power may fail.
         console: whether other processes of this user can look at the system and drive it, as the command rr-actors.
             Default: True. Turn it off if nobody but the application may.
-        clients_limit: the clients (rr.connect) and consoles that may be connected at once, however many connections
+        connections_limit: the connections (rr.connect) and consoles that may be open at once, however many sockets
             each has. Default: 128. Raise it for a larger pool of workers.
         events_limit_bytes: the size of the files in which the system remembers what happened. Default: 16,777,216.
             Raise it if a day does not fit; lower it on a small disk.
@@ -149,7 +149,7 @@ class SystemConfig:
     logging: bool = True
     durability: Durability = "process"
     console: bool = True
-    clients_limit: int = 128
+    connections_limit: int = 128
     events_limit_bytes: int = 16 * 2**20
     events_kept_s: float = 86_400.0
     registrars: Mapping[str, RegistrarConfig] = field(default_factory=dict[str, RegistrarConfig])
@@ -267,7 +267,7 @@ _SYSTEM_RULES: dict[str, _Rule] = {
     "logging": _BOOL,
     "durability": _DURABILITY,
     "console": _BOOL,
-    "clients_limit": _COUNT,
+    "connections_limit": _COUNT,
     "events_limit_bytes": _COUNT,
     "events_kept_s": _SECONDS,
     "registrars": _Rule("a mapping from registrar names to RegistrarConfig", _is_registrars),

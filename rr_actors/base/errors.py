@@ -447,7 +447,7 @@ class ResourceLost(RrError):
 
 
 class AskFailed(RrError):
-    """The handler of an actor raised while a client of rr.connect() asked it: its exception cannot be brought here.
+    """The handler of an actor raised while a connected program asked it: its exception cannot be brought here.
 
     `.actor`: as it was asked; `.error`: the exception's class, "ValueError", as its text names it.
     `.traceback`: its lines as Python prints them; a note shows them, too.
@@ -463,7 +463,7 @@ class Unavailable(RrError):
 
 
 class NotRunning(Unavailable):
-    """No running system was reached, or the system has ended, or the client of it is closed."""
+    """No running system was reached, or the system has ended, or the connection to it is closed."""
 
 
 class RegistrarDown(Unavailable):

@@ -17,8 +17,8 @@ from typing import NamedTuple
 
 from rr_actors.base.errors import InvalidName, NotFound, did_you_mean, exact_text, few, is_a, shown
 
-CLIENTS = "client."
-"""The prefix of the registrars of clients (rr.connect()); no other registrar has it."""
+CONNECTED = "connection."
+"""The prefix of the registrars of connected programs (rr.connect()); no other registrar has it."""
 
 REGISTRAR = "registrar"
 """The last id in the path of a manager's registrar, "root/cameras/registrar"."""

@@ -52,6 +52,9 @@ T = TypeVar("T")
 CALL_TIMEOUT_S = 30.0
 """Seconds for which a thread waits until the loop has answered a short call."""
 
+_NOTED = 256
+"""So many calls without waiting are known, before those that are answered are forgotten."""
+
 _ANSWERS_AT_ONCE = 16
 """The most answers of this process to tasks that come without a turn of their event loop."""
 
@@ -72,6 +75,7 @@ class Calls:
         self._unshared = 0
         # no references: a closed event loop never ends its turn, and would keep its task
         self._turn: tuple[weakref.ref[asyncio.AbstractEventLoop], weakref.ref[asyncio.Task[Any]]] | None = None
+        self._unawaited: dict[tuple[int, str], weakref.ref[Reply[Any]]] = {}  # the last of each sender and provider
 
     def check_open(self) -> None:
         """Raise RegistrarDown if the registrar is closed."""
@@ -101,11 +105,14 @@ class Calls:
     def connections_to(self, client: ProviderLink) -> ThreadConnections[Exchange] | None:
         """Return the connections of threads to a provider, beside the present link; None if the link is to be used.
 
-        There are none before the provider is reconciled over the present link. By then its Peer row is on disk, by
-        which it is found after a crash. The first call goes by the link: to open a connection costs more than one call
-        saves.
+        There are none while something that the caller has sent by the link is unanswered: the messages of one sender
+        keep their order. There are none before the provider is reconciled over the present link. By then its Peer row
+        is on disk, by which it is found after a crash. The first call goes by the link: to open a connection costs more
+        than one call saves.
         """
         catalog, provider = self.actor.catalog, client.provider
+        if self._unawaited and self._would_overtake(provider):
+            return None
         if catalog.up.get(provider) != client.opened or provider not in catalog.peers:
             return None
         if self.actor.closed or self.dispatcher.closed:  # in a forked child, all of this belongs to the parent
@@ -114,6 +121,26 @@ class Calls:
             client.is_uncalled = False
             return None
         return client.connections
+
+    def note_unawaited(self, provider: str, future: Reply[Any]) -> None:
+        """Note that the calling thread, or task, goes on while the loop sends what it has asked of a provider."""
+        if len(self._unawaited) >= _NOTED:
+            for key, noted in list(self._unawaited.items()):
+                if (other := noted()) is None or other.done():
+                    self._unawaited.pop(key, None)
+        self._unawaited[_sender(), provider] = weakref.ref(future)
+
+    def _would_overtake(self, provider: str) -> bool:
+        """Return whether the last thing that the calling thread, or task, has so asked of a provider is unanswered."""
+        key = _sender(), provider
+        noted = self._unawaited.get(key)
+        if noted is None:
+            return False
+        future = noted()
+        if future is not None and not future.done():
+            return True
+        self._unawaited.pop(key, None)
+        return False
 
     def line_of_task(self, connections: ThreadConnections[Exchange], query_id: str) -> BlockingLink | None:
         """Return a connection for the running task's call about a query; None if the loop has to ask instead.
@@ -228,6 +255,13 @@ class Calls:
             raise Unavailable(f"registrar {self.actor.name!r}: {what} took longer than {timeout_s:g} s") from None
 
 
+def _sender() -> int:
+    """Return what tells the calling task from others, or the thread that runs none. It may be reused after its end."""
+    loop = asyncio._get_running_loop()
+    task = None if loop is None else asyncio.current_task(loop)
+    return threading.get_ident() if task is None else id(task)
+
+
 def settle(future: Reply[Any], error: Exception | None, value: Any = None) -> None:
     """Set the reply with the error, or with the value if there is no error."""
     future.set(value) if error is None else fail(future, error)
@@ -304,9 +338,10 @@ def answered(actor: RegistrarActor, client: ProviderLink, message: Message) -> A
 
     Record both if there is a recording.
     """
+    at = time.time() if actor.node.watched.level[0] > 1 else None
     answer = client.answer_at_once(message)
-    if answer is not None and actor.node.watched.level[0] > 1:
-        actor.recorder.message("sent", actor.name, client.provider, message)
+    if answer is not None and at is not None:
+        actor.recorder.message("sent", actor.name, client.provider, message, at)
         actor.recorder.message("received", actor.name, client.provider, answer)
     return answer
 
@@ -396,7 +431,9 @@ class Loads:
         try:
             self._listen(query, options)
             hearing = None if hearer is None else HearsInWorkers(hearer, query.id)
-            return self._begin(query, request, options, hearing)
+            loading = self._begin(query, request, options, hearing)
+            self.calls.note_unawaited(target.registrar, loading)
+            return loading
         except RrError:
             raise
         except BaseException:  # such as KeyboardInterrupt: the caller never gets the future
@@ -909,7 +946,11 @@ class Unloads:
 
     def begin(self, query_id: str, timeout_s: float | None) -> Unloading:
         """Begin to release a query, and return a future of its end at once."""
-        return self._begin(Unloading(self, query_id, timeout_s, timeout_s), self.release)
+        held = self._actor.catalog.held.get(query_id)
+        unloading = self._begin(Unloading(self, query_id, timeout_s, timeout_s), self.release)
+        if held is not None:
+            self.calls.note_unawaited(held.registrar, unloading)
+        return unloading
 
     def _begin(self, unloading: Unloading, release: Release) -> Unloading:
         self.calls.dispatcher.call(unloading.begin, release, unloading.query_id, unloading.end)
@@ -996,7 +1037,10 @@ class Unloads:
 
         if server is not None:
             self.calls.call(self._check_client, server)
-        return self.calls.call(self._many_now, is_wanted, timeout_s)
+        reply = self.calls.call(self._many_now, is_wanted, timeout_s)
+        for provider in list(self._actor.clients) if server is None else [server.registrar]:
+            self.calls.note_unawaited(provider, reply)
+        return reply
 
     def wait_all(self, server: ServerId | None, timeout_s: float | None) -> None:
         """Release as begin_all() does, and return when all have been tried."""

@@ -101,7 +101,7 @@ class Status(StatusMessage):
         query_id: the receiver's query on that resource; "" if the resource is the receiver's own.
         source: the server where the status began, "registrar/server".
         repeated: whether the status may have been heard before; a crash made that uncertain.
-        reason: "revoked" if the resource's owner takes it away; "ended" if a client's system has ended; "" else.
+        reason: "revoked" if the resource's owner takes it away; "ended" if a connection's system has ended; "" else.
         deadline_s: of a revoked resource, how many seconds after the status was sent it is unloaded by force: 0.0, if
             that is done. None for any other status.
     """
@@ -364,8 +364,8 @@ class Query(Generic[Response]):
             UnknownQuery: the query is released, or another process holds it.
             InvalidName, UsageError: an argument is something else, or there are several streams that are meant.
             NotFound: the resource has no stream of this name. If it has none at all, this is known at once, to a
-                client a moment later, by the iteration; or, if the manager has crashed since the load, the iteration
-                raises it after thirty seconds. `.id`, `.known`
+                connected program a moment later, by the iteration; or, if the manager has crashed since the load, the
+                iteration raises it after thirty seconds. `.id`, `.known`
             ResourceLost: by the iteration: the resource was lost.
             Unavailable: by the iteration: the manager has ended, and its server opens the stream in no callback that
                 runs then. Or a frame cannot be read now; the next call goes on.

@@ -1,7 +1,7 @@
 """Registrars that another process has: how they are called from here.
 
 RemoteLoads and RemoteUnloads wait, withdraw and release in one way for all of them. A subclass of RemoteCalls carries
-the calls: a handle's to a registrar of the same system, a client's (system/console/connected_client.py) to the system
+the calls: a handle's to a registrar of the same system, a connection's (system/console/connection.py) to the system
 that it has connected to.
 """
 

@@ -160,7 +160,7 @@ def patched() -> str:
             return (
                 f"{patcher} has patched {', '.join(found)} in process {os.getpid()}: no event loop can run there in a "
                 f"thread of its own. Call {patch}({', '.join(f'{part}=False' for part in parts)}), or run the system "
-                "in a process that is not patched: its clients (rr.connect) may be"
+                "in a process that is not patched: programs that connect to it (rr.connect) may be"
             )
     return ""
 

@@ -25,7 +25,7 @@ from rr_actors.base.errors import (
     StartFailed,
     few,
 )
-from rr_actors.base.names import CLIENTS
+from rr_actors.base.names import CONNECTED
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.registrar.declarations import class_names
@@ -139,7 +139,7 @@ class Entries:
 
         Raises:
             NameTaken: one does; it is left alone.
-            InvalidSpec: one has a client's name, or a renamed_from.
+            InvalidSpec: one has a connection's name, or a renamed_from.
         """
         for where in renamed_managers(spec, path):
             expected = "None in a child that is added at run time: the others have loaded from it under its old id"
@@ -298,10 +298,11 @@ def manager_of(spec: ChildSpec) -> type[Manager] | None:
 
 
 def check_managers(names: list[str], where: str) -> None:
-    """Raise InvalidSpec for a manager with a client's name: its registrar would be given up with its application."""
+    """Raise InvalidSpec for a manager with a connection's name: its application's end would give up its registrar."""
     for name in names:
-        if name.startswith(CLIENTS):
-            expected = f"a manager's id that does not begin with {CLIENTS!r}, as those of clients do (rr.connect())"
+        if name.startswith(CONNECTED):
+            whose = "as those of connected programs do (rr.connect())"
+            expected = f"a manager's id that does not begin with {CONNECTED!r}, {whose}"
             raise invalid(where, "id", expected, name)
 
 

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from rr_actors.base.config import CATALOG_FILE, RegistrarConfig, SystemConfig, called
 from rr_actors.base.errors import CatalogError, CatalogLocked, ConfigError, NameTaken, RrError, is_a
-from rr_actors.base.names import CLIENTS, check_name
+from rr_actors.base.names import CONNECTED, check_name
 from rr_actors.base.reporting.log import Log
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.model.rows import (
@@ -103,11 +103,11 @@ def registrar_in(node: Node, name: str, *, patient: bool, owner: object = None) 
 
 
 def left_behind(config: SystemConfig, state_dir: Path, except_for: set[str]) -> dict[str, str]:
-    """Return the registrars whose catalog on disk holds or serves something, or cannot be read, and all of clients.
+    """Return the registrars whose catalog on disk holds or serves something, or cannot be read.
 
-    Each has a text that says what it serves and holds. Log it for each that is no client's, as a warning if it serves
-    something, and remove the catalogs
-    that have nothing to be missed. Blocks.
+    Those of connected programs are always among them. Each has a text that says what it serves and holds. Log it
+    for each that is no connected program's, as a warning if it serves something, and remove the catalogs that have
+    nothing to be missed. Blocks.
 
     Args:
         except_for: names of registrars that are about to be opened.
@@ -121,9 +121,11 @@ def left_behind(config: SystemConfig, state_dir: Path, except_for: set[str]) -> 
             rows = read_rows(catalog)
             peers = [config.registrar(row.id).catalog_path(state_dir) for row in rows if isinstance(row, Peer)]
             there = any(isinstance(row, Held | Resource | Notice) for row in rows)
-            if there or name.startswith(CLIENTS) or any(_has_something(peer, name) for peer in peers):
+            if there or name.startswith(CONNECTED) or any(_has_something(peer, name) for peer in peers):
                 found[name] = contents(rows)
-                if not name.startswith(CLIENTS):  # one that only holds is mostly the application's, which opens it next
+                if not name.startswith(
+                    CONNECTED
+                ):  # one that only holds is mostly the application's, which opens it next
                     serves = any(isinstance(row, Resource) for row in rows)
                     logger.log(logging.WARNING if serves else logging.INFO, _DORMANT, name, found[name], name)
             elif config.registrar(name).location is None:
@@ -232,13 +234,13 @@ def _has_something(catalog: Path, origin: str) -> bool:
     return any(isinstance(row, ServedQuery | Notice) and row.origin == origin for row in rows)
 
 
-async def give_up_clients(node: Node, names: Iterable[str]) -> None:
-    """Give up the registrars in `names` that clients of a killed application have left, and erase their catalogs.
+async def give_up_connected(node: Node, names: Iterable[str]) -> None:
+    """Give up the registrars in `names` that connected programs have left, and erase their catalogs.
 
     On the loop.
     """
     for name in names:
-        if name.startswith(CLIENTS):
+        if name.startswith(CONNECTED):
             try:
                 await give_up(node, name, erase=True)
             except RrError as error:  # a damaged catalog, for instance: the system starts all the same

@@ -38,7 +38,7 @@ from rr_actors.base.errors import (
     is_a,
     shown,
 )
-from rr_actors.base.names import CLIENTS, check_name
+from rr_actors.base.names import CONNECTED, check_name
 from rr_actors.base.notebook import note_started, warn_of_redefined
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.scarcity import wanted_by
@@ -81,7 +81,7 @@ from rr_actors.supervision.name_entries import Entries, check_managers, registra
 from rr_actors.supervision.supervisor import SupervisorActor, SupervisorRef, supervisor_at
 from rr_actors.system.backups import Backup, back_up, restore
 from rr_actors.system.console.asking.waiting import waited_for
-from rr_actors.system.console.console_client import ConsoleClient, find_console
+from rr_actors.system.console.console_connection import ConsoleConnection, find_console
 from rr_actors.system.console.console_server import Console
 from rr_actors.system.endings import Termination, Told, stop_dropped, wait_stopped, weakly
 from rr_actors.system.event_subscribers import Event, Facts, Subscribers
@@ -90,7 +90,7 @@ from rr_actors.system.recording.figures import Counters, Figure, figures_of
 from rr_actors.system.recording.recordings import LIMIT as RECORDING_LIMIT
 from rr_actors.system.recording.recordings import Recording, Recordings, note_present, present_entries
 from rr_actors.system.registrar_lookup import (
-    give_up_clients,
+    give_up_connected,
     gone_and_serving,
     left_behind,
     open_registrar,
@@ -348,7 +348,7 @@ class System:
             dormant = await node.dispatcher.workers.run(left_behind, self.config, Path(info.state_dir), in_tree)
             for name, contents in dormant.items():
                 node.directory.mark(registrar_key(name), Presence.DORMANT, contents)
-            await give_up_clients(node, dormant)
+            await give_up_connected(node, dormant)
             if self.config.console:
                 shut_down = weakly(self._shut_down)
                 kept = self._memory, self._child_logs
@@ -656,14 +656,16 @@ class System:
         """Open a registrar in this process, to consume or provide resources, or both. It continues its catalog.
 
         Raises:
-            InvalidName: the name has characters that no name may have, or begins with "client.".
+            InvalidName: the name has characters that no name may have, or begins with "connection.".
             NameTaken: another registrar of the system has the name.
             ConfigError: `config` is no RegistrarConfig, or has another name.
             CatalogError: the catalog is locked, damaged or of another version.
         """
         node = self._running()
-        if check_name(name, "registrar name").startswith(CLIENTS):
-            expected = f"a name that does not begin with {CLIENTS!r}, as those of clients do (rr.connect())"
+        if check_name(name, "registrar name").startswith(CONNECTED):
+            expected = (
+                f"a name that does not begin with {CONNECTED!r}, as those of connected programs do (rr.connect())"
+            )
             raise InvalidName(f"registrar name {name!r}: expected {expected}", name=name)
         return open_registrar(node, name, self.config.registrar(name) if config is None else config, self)
 
@@ -767,7 +769,7 @@ class System:
                     return self.ref(id).is_alive()
             return True
 
-        return waited_for(lambda: ConsoleClient(find_console(self.state_dir)), id, state, timeout_s, is_so)
+        return waited_for(lambda: ConsoleConnection(find_console(self.state_dir)), id, state, timeout_s, is_so)
 
     def supervisor(self, path: str | None = None) -> SupervisorRef:
         """Return a supervisor by its path of ids, "root/inner" or "inner"; without a path, the root supervisor.
@@ -1122,7 +1124,7 @@ def _root_of(root: object) -> Supervisor:
 
 
 def _check_tree(supervisor: Supervisor, path: str) -> None:
-    """Check that every child can be hosted, and that no two managers would have the same registrar, or a client's."""
+    """Check that every child can be hosted, and that no two managers have one registrar, or a connection's name."""
     for spec in supervisor.child_specs:
         inner = spec.actor_class_or_manager
         if isinstance(inner, Supervisor):

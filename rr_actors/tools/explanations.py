@@ -13,7 +13,7 @@ from rr_actors.base.names import short_id, short_ids, time_in
 from rr_actors.registrar.model.failures import WAITS_FOR_SERVER
 from rr_actors.registrar.pages import HolderRow, QueryRow, ResourceRow
 from rr_actors.streams.stream import StreamRow
-from rr_actors.system.console.console_client import ConsoleClient
+from rr_actors.system.console.console_connection import ConsoleConnection
 from rr_actors.system.console.console_messages import Found
 from rr_actors.system.console.console_questions import Find, ListEvents, ListHistory
 from rr_actors.system.recording.event_memory import Event
@@ -27,14 +27,14 @@ _NAMES_KEPT = 10_000
 _names: dict[str, str] = {}  # of resources, by their ids
 
 
-def explain(client: ConsoleClient, id: str) -> list[str]:
+def explain(connection: ConsoleConnection, id: str) -> list[str]:
     """Return sentences about the query or resource whose id or name is `id`, or whose id begins or ends so.
 
     Raises:
         UnknownQuery: no registrar has such an id.
         UsageError: more than five ids have `id` in them.
     """
-    found = client.ask(Find(id))
+    found = connection.ask(Find(id))
     if not found.queries and not found.resources:
         hint = "; ".join(found.notes) or "rr-actors resources lists those that there are"
         raise UnknownQuery(f"{shown(id)}: no query and no resource has this id ({hint})", query_id=id)
@@ -46,9 +46,9 @@ def explain(client: ConsoleClient, id: str) -> list[str]:
         raise UsageError(f"{shown(id)}: several ids have this in them: {several}; give more of the id")
     lines: list[str] = []
     for query in found.queries:
-        lines += _of_query(client, query)
+        lines += _of_query(connection, query)
     for resource in resources:
-        lines += _of_resource(client, resource)
+        lines += _of_resource(connection, resource)
     for waiting in line:
         holder = waiting.holders[0]
         said = f" ({waiting.message})" if waiting.message else ""
@@ -105,8 +105,8 @@ def _waits(what: str, query_id: str) -> str:
     return f"has waited for {what}{since}" if since else f"waits for {what}"
 
 
-def _of_query(client: ConsoleClient, query: QueryRow) -> Iterator[str]:
-    whose = name_of_resource(client.ask, query.parent, query.origin) if query.parent else "itself"
+def _of_query(connection: ConsoleConnection, query: QueryRow) -> Iterator[str]:
+    whose = name_of_resource(connection.ask, query.parent, query.origin) if query.parent else "itself"
     said = f"Query {short_id(query.id)}: {query.origin}"
     match query.hold:
         case "pending":
@@ -117,7 +117,7 @@ def _of_query(client: ConsoleClient, query: QueryRow) -> Iterator[str]:
             yield f"{said} {_holds(query.name, query.id)}, for {whose}{_priority(query.priority)}."
 
 
-def _of_resource(client: ConsoleClient, resource: ResourceRow) -> Iterator[str]:
+def _of_resource(connection: ConsoleConnection, resource: ResourceRow) -> Iterator[str]:
     yield f"{_named(resource)} {_phase(resource)}"
     if resource.message.startswith(WAITS_FOR_SERVER):
         yield f"It {resource.message}."
@@ -126,7 +126,7 @@ def _of_resource(client: ConsoleClient, resource: ResourceRow) -> Iterator[str]:
         yield f"It is revoked ({resource.message}): it is unloaded {when}."
     elif resource.message and resource.phase in ("loaded", "unloading", "paused"):
         yield f"Its last status was {resource.state}: {resource.message}"
-    yield from _past_of(client, resource)
+    yield from _past_of(connection, resource)
     if not resource.holder_count:
         yield "Nobody holds it."
     elif resource.priority is None:
@@ -134,19 +134,21 @@ def _of_resource(client: ConsoleClient, resource: ResourceRow) -> Iterator[str]:
     elif resource.priority:
         yield f"Its priority is {resource.priority}, the highest of its holders."
     for holder in resource.holders:
-        yield from _of_holder(client, holder, "", {resource.id})
+        yield from _of_holder(connection, holder, "", {resource.id})
     if resource.holder_count > len(resource.holders):
         yield f"It has {counted(resource.holder_count - len(resource.holders), 'more holder')}."
-    for stream in client.streams(resource.server.partition("/")[0], resource.id).rows:
+    for stream in connection.streams(resource.server.partition("/")[0], resource.id).rows:
         by = f"is read by {readers_text(stream)}" if stream.readers else "has no reader"
         yield f"Its stream {stream.info.name!r} {by}."
     for part in resource.parts:
-        yield from _of_part(client, part, "", {resource.id})
+        yield from _of_part(connection, part, "", {resource.id})
 
 
-def _past_of(client: ConsoleClient, resource: ResourceRow) -> Iterator[str]:
+def _past_of(connection: ConsoleConnection, resource: ResourceRow) -> Iterator[str]:
     """Say since when a resource has its state, and what happened before to it and to the child that serves it."""
-    events = [one for one in client.ask(ListEvents(resource.id)).events if one.facts.get("resource_id") == resource.id]
+    events = [
+        one for one in connection.ask(ListEvents(resource.id)).events if one.facts.get("resource_id") == resource.id
+    ]
     since = None
     for event in reversed([one for one in events if one.event == "status"]):
         if event.facts["detail"].partition(" ")[0] != resource.state:
@@ -154,14 +156,14 @@ def _past_of(client: ConsoleClient, resource: ResourceRow) -> Iterator[str]:
         since = event.at
     if since is not None:
         with contextlib.suppress(NotFound):  # an application's registrar is no child
-            events += client.ask(ListHistory(resource.server.partition("/")[0])).events
+            events += connection.ask(ListHistory(resource.server.partition("/")[0])).events
         yield from _past("It", resource.state, since, events)
 
 
-def past_of_child(client: ConsoleClient, id: str) -> Iterator[str]:
+def past_of_child(connection: ConsoleConnection, id: str) -> Iterator[str]:
     """Say since when a child has its state, and what happened to it before; nothing of what is no child."""
     with contextlib.suppress(NotFound):
-        events = client.ask(ListHistory(id)).events
+        events = connection.ask(ListHistory(id)).events
         path = min((one.path for one in events), key=len, default="")
         own = [one for one in events if one.path == path and one.facts.get("state") is not None]
         if len(own) > 1 and path.rpartition("/")[2] == id.rpartition("/")[2]:
@@ -236,7 +238,7 @@ def _phase(resource: ResourceRow) -> str:
             return f"{f'has been loaded{since}' if since else 'is loaded'}; its state is {resource.state}."
 
 
-def _of_holder(client: ConsoleClient, holder: HolderRow, indent: str, below: set[str]) -> Iterator[str]:
+def _of_holder(connection: ConsoleConnection, holder: HolderRow, indent: str, below: set[str]) -> Iterator[str]:
     """Say that a holder holds the resource; if that is for another resource, say who holds the other one."""
     if holder.unheard:
         yield f"{indent}{holder.origin} has not dealt with {holder.unheard} of its statuses."
@@ -244,21 +246,21 @@ def _of_holder(client: ConsoleClient, holder: HolderRow, indent: str, below: set
         query = f"(query {short_id(holder.query_id)}){_priority(holder.priority)}"
         yield f"{indent}{holder.origin} {_holds('it', holder.query_id)}, for itself {query}."
         return
-    above = client.ask(Find(holder.parent)).resources
+    above = connection.ask(Find(holder.parent)).resources
     what = _named(above[0]) if above else f"its resource {short_id(holder.parent)}"
     yield f"{indent}{holder.origin} {_holds('it', holder.query_id)}, for {what}{_priority(holder.priority)}."
     if above and holder.parent not in below and len(below) < _DEEP:
         for other in above[0].holders:
-            yield from _of_holder(client, other, indent + "  ", below | {holder.parent})
+            yield from _of_holder(connection, other, indent + "  ", below | {holder.parent})
 
 
 def _priority(priority: int | None) -> str:
     return ", on standby" if priority is None else f", with priority {priority}" if priority else ""
 
 
-def _of_part(client: ConsoleClient, part: str, indent: str, above: set[str]) -> Iterator[str]:
+def _of_part(connection: ConsoleConnection, part: str, indent: str, above: set[str]) -> Iterator[str]:
     """Say on which part a resource depends; if it waits for the part, or the part is not well, say why."""
-    found = client.ask(Find(part))
+    found = connection.ask(Find(part))
     queries = [query for query in found.queries if query.id == part]
     if not queries:
         return
@@ -280,7 +282,7 @@ def _of_part(client: ConsoleClient, part: str, indent: str, above: set[str]) -> 
         elif resource.message:
             yield f"{indent}  Its last status was {resource.state}: {resource.message}"
         for other in resource.parts:
-            yield from _of_part(client, other, indent + "  ", above | {resource.id})
+            yield from _of_part(connection, other, indent + "  ", above | {resource.id})
 
 
 # -- actors -----------------------------------------------------------------------------------------------------------

@@ -16,8 +16,8 @@ import msgspec
 from rr_actors.base.config import CATALOG_FILE
 from rr_actors.base.errors import ActorUnavailable, NotFound, NotRunning, UsageError, few
 from rr_actors.base.names import child_meant, no_child
-from rr_actors.system.console.console_client import ConsoleClient
 from rr_actors.system.console.console_commands import Kill
+from rr_actors.system.console.console_connection import ConsoleConnection
 from rr_actors.system.console.console_messages import ChildRow
 from rr_actors.tools.inspection import Contents, check, check_delivered, read_state
 
@@ -87,12 +87,12 @@ class RandomKills:
         UsageError: no child can be killed; the text says why.
     """
 
-    def __init__(self, client: ConsoleClient, plan: KillPlan, say: Callable[[str], None]) -> None:
-        self._client = client
+    def __init__(self, connection: ConsoleConnection, plan: KillPlan, say: Callable[[str], None]) -> None:
+        self._connection = connection
         self._plan = plan
         self._say = say
         self._chance = random.Random(plan.seed)
-        self._state_dir = Path(client.welcome.state_dir)
+        self._state_dir = Path(connection.welcome.state_dir)
         self._returns: set[str] = set()  # paths of children that their supervisors start again
         self._began = time.monotonic()
         self.report = KillReport(plan.seed, {})
@@ -116,7 +116,7 @@ class RandomKills:
             return path in self._returns
         above = path.rpartition("/")[0]
         try:
-            facts = self._client.ask(Kill(path, dry_run=True)).facts
+            facts = self._connection.ask(Kill(path, dry_run=True)).facts
         except UsageError:
             why = "it runs in a thread, in a process with others"
         except (ActorUnavailable, NotFound):  # it has ended meanwhile
@@ -159,7 +159,7 @@ class RandomKills:
         time.sleep(self._chance.uniform(0.0, _MOMENT_S))
         before = self._rows()
         try:
-            pid: int = self._client.ask(Kill(path)).facts["pid"]
+            pid: int = self._connection.ask(Kill(path)).facts["pid"]
         except (ActorUnavailable, NotFound):  # it has ended meanwhile: no process got a signal
             return
         self.report.kills.append(Killed(path, pid))
@@ -212,7 +212,7 @@ class RandomKills:
         self.report.violations += [f"{when}: {one}" for one in sorted(left)]
 
     def _look(self) -> list[str]:
-        registrars = {row.name: row.status for row in self._client.registrars().rows}
+        registrars = {row.name: row.status for row in self._connection.registrars().rows}
         state = _catalogs(self._state_dir)
         down = {name for name in {*registrars, *state} if registrars.get(name) != "up"}
         self.report.catalogs = len(state)
@@ -220,7 +220,7 @@ class RandomKills:
         return [*check(state), *check_delivered(state, down)]
 
     def _rows(self) -> dict[str, ChildRow]:
-        rows = self._client.children().rows
+        rows = self._connection.children().rows
         if rows[0].state == "stopped":
             raise NotRunning(f"the system in {self._state_dir} has ended: {rows[0].error}")
         return {row.path: row for row in rows}

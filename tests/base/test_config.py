@@ -66,7 +66,7 @@ def test_a_systems_defaults() -> None:
     assert (config.frame_limit_bytes, config.mailbox_limit, config.workers_limit) == (16 * 2**20, 100_000, 4096)
     assert (config.ask_timeout_s, config.start_timeout_s, config.stop_timeout_s) == (30.0, 30.0, 10.0)
     assert (config.preload, config.durability, config.registrars) == ((), "process", {})
-    assert (config.console, config.clients_limit) == (True, 128)
+    assert (config.console, config.connections_limit) == (True, 128)
 
 
 REGISTRAR_MISTAKES = [
@@ -91,7 +91,7 @@ SYSTEM_MISTAKES = [
     ("frame_limit_bytes", 1.5, "a whole number greater than 0"),
     ("mailbox_limit", 0, "a whole number greater than 0"),
     ("workers_limit", True, "a whole number greater than 0"),
-    ("clients_limit", 0, "a whole number greater than 0"),
+    ("connections_limit", 0, "a whole number greater than 0"),
     ("ask_timeout_s", -1, "a number of seconds greater than 0"),
     ("start_timeout_s", None, "a number of seconds greater than 0"),
     ("stop_timeout_s", "10", "a number of seconds greater than 0"),

@@ -196,3 +196,15 @@ def test_the_example_is_short_and_begins_with_what_it_shows(name: str) -> None:
     text = (REPOSITORY / "examples" / f"{name}.py").read_text()
     assert len(text.splitlines()) < 60
     assert text.startswith('"""')
+
+
+ABOUT_MESSAGES = (
+    "ping_pong", "bounded_buffer", "philosophers", "token_ring", "state_machine", "tell_and_ask", "full_mailbox",
+    "dead_letter",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ABOUT_MESSAGES)
+def test_an_example_about_messages_has_at_most_thirty_lines_of_code(name: str) -> None:
+    _, _, code = (REPOSITORY / "examples" / f"{name}.py").read_text().split('"""', 2)
+    assert len([line for line in code.splitlines() if line.strip() and not line.lstrip().startswith("#")]) <= 30

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
+import random
 import re
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Coroutine, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +15,8 @@ import pykka
 import pytest
 
 import rr_actors as rr
-from rr_actors.actors.messaging.mailbox import Mailbox
 from rr_actors.actors.turns import AT_ONCE, TurnActor
 from support import REPOSITORY, eventually
-from support_inside import actor_of
 
 LIMIT_S = 20.0
 PAGE = REPOSITORY / "docs" / "life-of-a-load.md"
@@ -64,23 +65,6 @@ def delivered(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
 
         monkeypatch.setattr(TurnActor, name, noted)
     return found
-
-
-def test_each_registrar_client_and_server_is_an_actor_with_a_mailbox(app: rr.Registrar) -> None:
-    app.register_server("thing", lambda request: request)
-    app.load("cameras/camera", "front")
-    app.load("app/thing", "x")
-    registrar = actor_of(app)
-    server = registrar.servers.get("thing")
-    assert server is not None
-    actors: dict[str, TurnActor] = {"app": registrar, "app/servers/thing": server}
-    actors |= {f"app/clients/{provider}": client for provider, client in registrar.clients.items()}
-    for path, actor in actors.items():
-        assert isinstance(actor, pykka.Actor)
-        assert isinstance(actor.actor_inbox, Mailbox)
-        assert len(actor.actor_inbox) == 0
-        assert actor.actor_ref.path == path
-        assert actor.actor_ref.is_alive()
 
 
 def test_a_server_ends_when_it_is_unregistered(system: rr.System, app: rr.Registrar) -> None:
@@ -203,30 +187,171 @@ def test_a_thread_that_joins_takes_the_turn_and_puts_nothing_into_a_mailbox(
     assert delivered == []
 
 
-@pytest.mark.parametrize("ways", ["over the loop", "by the turn of the sender", "by both"])
-def test_the_messages_of_one_sender_keep_their_order_over_both_ways(
-    system: rr.System, app: rr.Registrar, ways: str
+# -- recordings of both ways -------------------------------------------------------------------------------------------
+
+FIRST = ["app>{0} Load", "{0} has Load", "{0} began load", "{0} ended load", "{0}>app Loaded", "app has Loaded"]
+JOINED = ["app>{0} Load", "{0} has Load", "{0}>app Loaded", "app has Loaded"]
+LEFT = ["app>{0} Unload", "{0} has Unload", "{0}>app Unloaded", "app has Unloaded"]
+LOADS: dict[str, Callable[[rr.Registrar, str, str], rr.Query[Any]]] = {
+    "over the loop": lambda app, server, request: app.load(server, request, block=False).get(timeout=LIMIT_S),
+    "by a thread's turn": lambda app, server, request: app.load(server, request),
+    "by a task's turn": lambda app, server, request: asyncio.run(_awaited(app, server, request)),
+}
+UNLOADS: dict[str, Callable[[rr.Registrar, rr.Query[Any]], object]] = {
+    "over the loop": lambda app, query: app.unload(query, block=False).get(timeout=LIMIT_S),
+    "by a thread's turn": lambda app, query: app.unload(query),
+    "by a task's turn": lambda app, query: asyncio.run(app.unload_async(query)),
+}
+
+
+async def _awaited(app: rr.Registrar, server: str, request: str) -> rr.Query[Any]:
+    return await app.load_async(server, request)
+
+
+def lines_of(recording: rr.Recording, query: str) -> list[str]:
+    """What a recording has of the messages of a query, in its order, and of the callbacks meanwhile."""
+    lines: list[str] = []
+    for entry in recording.entries():
+        if entry.query == query and entry.event == "sent":
+            lines.append(f"{entry.registrar}>{entry.peer} {entry.name}")
+        elif entry.query == query and entry.event == "received":
+            lines.append(f"{entry.registrar} has {entry.name}")
+        elif entry.event in ("began", "ended"):
+            lines.append(f"{entry.registrar} {entry.event} {entry.name}")
+    return lines
+
+
+@pytest.mark.parametrize("way", LOADS)
+@pytest.mark.parametrize("provider", ["near", "cameras"])
+def test_a_recording_has_the_same_of_a_load_whoever_takes_the_turn(
+    system: rr.System, app: rr.Registrar, delivered: list[tuple[str, str]], provider: str, way: str
 ) -> None:
     near = system.open_registrar("near")
-    order: list[str] = []
-    near.register_server(
-        "thing", lambda request: order.append(request) or request, unload=lambda request, _: order.append(request)
-    )
-    block: dict[str, Callable[[int], bool]] = {
-        "over the loop": lambda _: False,
-        "by the turn of the sender": lambda _: True,
-        "by both": lambda turn: turn % 2 == 0,
-    }
-    expected: list[str] = []
-    for turn in range(20):
-        name = f"thing {turn}"
-        waits = block[ways](turn)
-        query = (
-            app.load("near/thing", name) if waits else app.load("near/thing", name, block=False).get(timeout=LIMIT_S)
-        )
-        query.unload() if not waits else app.unload(query)
-        expected += [name, name]
-    assert order == expected
+    near.register_server("camera", lambda request: request)
+    load, unload, server = LOADS[way], UNLOADS[way], f"{provider}/camera"
+    for _ in range(3):  # the first loads of a thread and a task make their connections
+        load(app, server, "warm")
+
+    def recorded(call: Callable[[], rr.Query[Any]], *expected: str) -> None:
+        wanted = [line.format(provider) for line in expected]
+        with system.record() as recording:
+            query = call()
+            eventually(lambda: len(lines_of(recording, query.id)) >= len(wanted), what=f"all of {wanted}")
+        assert lines_of(recording, query.id) == wanted
+
+    def join_and_leave() -> rr.Query[Any]:
+        query = load(app, server, "x")
+        unload(app, query)
+        return query
+
+    recorded(lambda: load(app, server, "x"), *FIRST)
+    del delivered[:]
+    recorded(join_and_leave, *JOINED, *LEFT)
+    taken = [message for actor, message in delivered if actor == "near"]
+    by_mailbox = provider == "near" and way == "over the loop"
+    assert ("Load" in taken) == by_mailbox  # an Unload is put into it also behind what the loop has not done yet
+
+
+# -- the order of one sender's messages --------------------------------------------------------------------------------
+
+
+class Shelf(rr.Manager):
+    """Notes the callbacks of its server in their order: "x" loads, "-x" unloads."""
+
+    def __init__(self) -> None:
+        self.order: list[str] = []
+
+    @rr.server("thing", at_once=1)
+    def thing(self, request: str) -> str:
+        self.order.append(request)
+        return request
+
+    @thing.unload
+    def unload_thing(self, request: str, response: str) -> None:
+        self.order.append(f"-{request}")
+
+    def on_receive(self, message: Any) -> list[str]:
+        return self.order
+
+
+async def mixed(app: rr.Registrar, wait: Waits, seed: int) -> list[str]:
+    """Load and unload at random, waiting for some calls while others are in flight; return what was asked for."""
+    choose = random.Random(seed)
+    asked: list[str] = []
+    held: list[rr.Query[Any]] = []
+    for turn in range(25):
+        loads: list[Any] = []
+        unloads: list[Any] = []
+        for number in range(choose.randrange(1, 6)):
+            if held and choose.random() < 0.4:
+                query = held.pop(choose.randrange(len(held)))
+                asked.append(f"-{query.response}")
+                unloads.append(app.unload(query, block=False))
+            else:
+                asked.append(f"{seed}.{turn}.{number}")
+                loads.append(app.load("shelf/thing", asked[-1], block=False))
+        if held and turn % 3 == 0:
+            query = held.pop()
+            asked.append(f"-{query.response}")
+            await wait.unload(app, query)
+        else:
+            asked.append(f"{seed}.{turn}.last")
+            held.append(await wait.load(app, asked[-1]))
+        held += [one.get(timeout=LIMIT_S) for one in loads]
+        for one in unloads:
+            one.get(timeout=LIMIT_S)
+    return asked
+
+
+class InThread:
+    """The blocking calls of a thread."""
+
+    async def load(self, app: rr.Registrar, request: str) -> rr.Query[Any]:
+        return app.load("shelf/thing", request)
+
+    async def unload(self, app: rr.Registrar, query: rr.Query[Any]) -> None:
+        app.unload(query)
+
+    def run(self, program: Coroutine[Any, Any, list[str]]) -> list[str]:
+        """Run the program, which awaits nothing, in a thread without an event loop."""
+
+        def steps() -> list[str]:
+            try:
+                program.send(None)
+            except StopIteration as end:
+                return end.value
+            raise AssertionError("it has awaited something")
+
+        with ThreadPoolExecutor(1) as threads:
+            return threads.submit(steps).result(LIMIT_S * 3)
+
+
+class InTask:
+    """The awaited calls of a task."""
+
+    async def load(self, app: rr.Registrar, request: str) -> rr.Query[Any]:
+        return await app.load_async("shelf/thing", request)
+
+    async def unload(self, app: rr.Registrar, query: rr.Query[Any]) -> None:
+        await app.unload_async(query)
+
+    def run(self, program: Coroutine[Any, Any, list[str]]) -> list[str]:
+        """Run the program as a task of an event loop."""
+        return asyncio.run(program)
+
+
+Waits = InThread | InTask
+
+
+@pytest.mark.parametrize("wait", [InThread(), InTask()], ids=["a thread", "a task"])
+@pytest.mark.parametrize("placement", ["process", "thread"])
+def test_the_messages_of_one_sender_keep_their_order_over_both_ways_with_others_in_flight(
+    start: Callable[..., rr.System], placement: Any, wait: Waits
+) -> None:
+    system = start(rr.ChildSpec(Shelf, id="shelf", placement=placement))
+    app = system.open_registrar("app")
+    asked = [one for seed in (1, 2) for one in wait.run(mixed(app, wait, seed))]
+    assert system.ref("shelf").ask("order") == asked
 
 
 def test_all_requests_are_sent_also_if_there_are_more_than_share_a_turn(system: rr.System, app: rr.Registrar) -> None:

@@ -503,8 +503,8 @@ def test_a_tilde_in_a_state_directory_is_the_users_home(tmp_path: Path, monkeypa
     with rr.System([rr.ChildSpec(Idle, id="a", placement="thread")], state_dir="~/state") as system:
         assert system.state_dir == tmp_path / "state"
         assert rr.System.running("~/state") is system
-        with rr.connect("~/state") as client:
-            assert client.pid == os.getpid()
+        with rr.connect("~/state") as connection:
+            assert connection.pid == os.getpid()
         ran = subprocess.run(
             [sys.executable, "-m", "rr_actors", "ps", "--state=~/state"], capture_output=True, text=True, timeout=30
         )

@@ -389,22 +389,22 @@ def test_a_quick_subscriber_has_heard_the_last_event_when_the_system_has_stopped
     assert [event["event"] for event in heard].count("unloaded") == COUNT
 
 
-# -- clients, handles, thread placement -----------------------------------------------------------------------------
+# -- connections, handles, thread placement --------------------------------------------------------------------------
 
 
-CLIENT_ENDS: dict[str, Callable[[rr.System, Any, Any, Any], object]] = {
-    "query.unload": lambda system, client, registrar, query: query.unload(),
-    "unload_client": lambda system, client, registrar, query: registrar.unload_client("provider/camera"),
-    "unload_all": lambda system, client, registrar, query: registrar.unload_all(),
-    "registrar.close": lambda system, client, registrar, query: registrar.close(),
-    "client.close": lambda system, client, registrar, query: client.close(),
+CONNECTION_ENDS: dict[str, Callable[[rr.System, Any, Any, Any], object]] = {
+    "query.unload": lambda system, connection, registrar, query: query.unload(),
+    "unload_client": lambda system, connection, registrar, query: registrar.unload_client("provider/camera"),
+    "unload_all": lambda system, connection, registrar, query: registrar.unload_all(),
+    "registrar.close": lambda system, connection, registrar, query: registrar.close(),
+    "connection.close": lambda system, connection, registrar, query: connection.close(),
 }
 
 
 @pytest.mark.usefixtures("runtime_dir")
-@pytest.mark.parametrize("end", CLIENT_ENDS.values(), ids=CLIENT_ENDS.keys())
+@pytest.mark.parametrize("end", CONNECTION_ENDS.values(), ids=CONNECTION_ENDS.keys())
 @pytest.mark.parametrize("listens", ["the query", "the query, async", "the server"])
-def test_no_status_callback_of_a_client_begins_after_an_end_has_returned(
+def test_no_status_callback_of_a_connection_begins_after_an_end_has_returned(
     system: rr.System,
     provider: rr.Registrar,
     state_dir: Path,
@@ -412,15 +412,15 @@ def test_no_status_callback_of_a_client_begins_after_an_end_has_returned(
     listens: str,
     end: Callable[[rr.System, Any, Any, Any], object],
 ) -> None:
-    with begun(provider, state_dir, slow, listens) as (client, registrar, query):
-        end(system, client, registrar, query)
+    with begun(provider, state_dir, slow, listens) as (connection, registrar, query):
+        end(system, connection, registrar, query)
 
         slow.check_nothing_more()
 
 
 @pytest.mark.usefixtures("runtime_dir")
 @pytest.mark.parametrize("listens", ["the query", "the query, async", "the server"])
-def test_the_one_status_that_a_client_hears_after_a_stop_is_that_the_system_has_ended(
+def test_the_one_status_that_a_connection_hears_after_a_stop_is_that_the_system_has_ended(
     system: rr.System, provider: rr.Registrar, state_dir: Path, slow: Slow, listens: str
 ) -> None:
     with begun(provider, state_dir, slow, listens):
@@ -436,12 +436,12 @@ def test_the_one_status_that_a_client_hears_after_a_stop_is_that_the_system_has_
 @contextlib.contextmanager
 def begun(
     provider: rr.Registrar, state_dir: Path, slow: Slow, listens: str
-) -> Iterator[tuple[rr.Client, Any, rr.Query[Any]]]:
-    """A client whose callback has begun to hear the first of many statuses."""
+) -> Iterator[tuple[rr.Connection, Any, rr.Query[Any]]]:
+    """A connection whose callback has begun to hear the first of many statuses."""
     serve(provider, "camera")
     serve(provider, "door")
-    with rr.connect(state_dir) as client:
-        registrar = client.open_registrar("worker")
+    with rr.connect(state_dir) as connection:
+        registrar = connection.open_registrar("worker")
         busy = Gate()  # the thread of the callbacks waits there until all statuses have arrived
         other = registrar.load("provider/door", "north", on_status=busy)
         callback: Heard = slow.awaited if "async" in listens else slow
@@ -457,4 +457,4 @@ def begun(
         eventually(lambda: query.fetch_state() == "WARNING")
         busy.open()
         slow.begun.wait()
-        yield client, registrar, query
+        yield connection, registrar, query

@@ -253,15 +253,15 @@ def test_two_wholes_that_wait_for_what_the_other_has_are_a_ring(people: Any) -> 
     next(load for load, error in zip(loads, errors, strict=True) if error is None).get().unload()
 
 
-def test_a_client_outside_waits_in_line_as_well(system: rr.System, people: Any) -> None:
+def test_a_connection_outside_waits_in_line_as_well(system: rr.System, people: Any) -> None:
     anna, *_ = people
-    with rr.connect(system.state_dir) as client:
-        bench = client.open_registrar("bench")
+    with rr.connect(system.state_dir) as connection:
+        bench = connection.open_registrar("bench")
         with anna.load(Scopes.open_scope, "bench"):
             with pytest.raises(rr.ResourceBusy) as info:
                 bench.load("scopes/scope", "bench", wait_s=0)
             assert info.value.holder == "anna"
-        with bench.load("scopes/scope", "bench"), pytest.raises(rr.ResourceBusy, match=r"client\.bench has it"):
+        with bench.load("scopes/scope", "bench"), pytest.raises(rr.ResourceBusy, match=r"connection\.bench has it"):
             anna.load(Scopes.open_scope, "bench", wait_s=0)
 
 

@@ -98,11 +98,11 @@ def test_no_parameters_take_no_request_awaited(app: rr.Registrar, sensors: rr.Ac
     asyncio.run(use())
 
 
-def test_a_client_loads_by_fields_and_without_a_request(
+def test_a_connection_loads_by_fields_and_without_a_request(
     app: rr.Registrar, system: rr.System, sensors: rr.ActorRef
 ) -> None:
-    with rr.connect(system.state_dir) as client:
-        registrar = client.open_registrar("desk")
+    with rr.connect(system.state_dir) as connection:
+        registrar = connection.open_registrar("desk")
         assert registrar.load("sensors/all").response == ["lidar", "sonar"]
         assert registrar.load("sensors/range", {"name": "sonar"}).response == "/sonar/10.0"
 

@@ -115,12 +115,12 @@ def test_the_frames_of_a_call_that_raises_are_freed_at_once(start: Start, state_
         rr.ChildSpec(Clerk, id="usher", placement="thread"),
     )
     app = system.open_registrar("app")
-    with rr.connect(state_dir) as client:
+    with rr.connect(state_dir) as connection:
         consumers: dict[str, Any] = {
             "app": app,
             "handle": system.registrar("shop"),
             "handle of a thread": system.registrar("near"),
-            "client": client.open_registrar("mine"),
+            "connection": connection.open_registrar("mine"),
         }
         calls = {name: functools.partial(call, system, app) for name, call in CALLS.items()}
         for whose, consumer in consumers.items():

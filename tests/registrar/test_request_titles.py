@@ -17,8 +17,8 @@ from rr_actors.managers.choices.chosen import Choose
 from rr_actors.managers.keeper.desired import Replica
 from rr_actors.managers.pipes.pipe_manager import Pipe
 from rr_actors.managers.programs import RunProgram
-from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_commands import SendStatus
+from rr_actors.system.console.console_connection import ConsoleConnection, find_console
 from rr_actors.system.console.console_questions import Find, ListEvents, ListQueries, ListResources
 from rr_actors.system.recording.event_texts import event_text
 from support import eventually
@@ -67,14 +67,14 @@ def app(start: Start) -> rr.Registrar:
 
 
 @pytest.fixture
-def console(app: rr.Registrar, state_dir: Path) -> Iterator[ConsoleClient]:
-    """A client of the system."""
-    with ConsoleClient(find_console(state_dir)) as client:
-        yield client
+def console(app: rr.Registrar, state_dir: Path) -> Iterator[ConsoleConnection]:
+    """A connection of the system."""
+    with ConsoleConnection(find_console(state_dir)) as connection:
+        yield connection
 
 
 def test_a_title_takes_the_place_of_a_request_at_its_provider_and_at_its_holders(
-    app: rr.Registrar, console: ConsoleClient
+    app: rr.Registrar, console: ConsoleConnection
 ) -> None:
     app.load("scanners/scan", Scan("attic", {"a": 1}))
 
@@ -85,7 +85,7 @@ def test_a_title_takes_the_place_of_a_request_at_its_provider_and_at_its_holders
     assert held.request == '{"options":{"a":1},"room":"attic"}'  # for programs
 
 
-def test_a_resource_is_found_by_its_title_and_by_its_request(app: rr.Registrar, console: ConsoleClient) -> None:
+def test_a_resource_is_found_by_its_title_and_by_its_request(app: rr.Registrar, console: ConsoleConnection) -> None:
     id = app.load("scanners/scan", Scan("cellar")).resource_id
 
     for name in ("scanners/scan of the cellar", 'scanners/scan {"options":{},"room":"cellar"}'):
@@ -93,7 +93,7 @@ def test_a_resource_is_found_by_its_title_and_by_its_request(app: rr.Registrar, 
     assert [row.id for row in console.ask(ListResources("of the cellar")).rows] == [id]
 
 
-def test_a_status_names_the_resource_by_its_title(app: rr.Registrar, console: ConsoleClient) -> None:
+def test_a_status_names_the_resource_by_its_title(app: rr.Registrar, console: ConsoleConnection) -> None:
     query = app.load("scanners/scan", Scan("hall"))
     console.ask(SendStatus(query.resource_id, "ERROR", "dust"))
 
@@ -104,7 +104,7 @@ def test_a_status_names_the_resource_by_its_title(app: rr.Registrar, console: Co
     assert eventually(told)
 
 
-def test_a_title_that_raises_leaves_the_request(app: rr.Registrar, console: ConsoleClient) -> None:
+def test_a_title_that_raises_leaves_the_request(app: rr.Registrar, console: ConsoleConnection) -> None:
     app.load("scanners/wrong", "x")
 
     assert [row.name for row in console.ask(ListResources()).rows] == ['scanners/wrong "x"']

@@ -17,7 +17,7 @@ from support import LIMIT_S, Calls, Gate, Workshop, eventually, kill, loaded_wit
 from support_managers import Order, Shop
 
 Start = Callable[..., rr.System]
-Consumer = rr.Registrar | rr.ClientRegistrar
+Consumer = rr.Registrar | rr.ConnectedRegistrar
 
 WARNING = rr.Status(rr.State.WARNING, "low light")
 
@@ -30,15 +30,15 @@ def messages(calls: Calls) -> list[str]:
     return [status.message for status in calls]
 
 
-@pytest.fixture(params=["registrar", "client"])
+@pytest.fixture(params=["registrar", "connection"])
 def consumer(request: pytest.FixtureRequest, app: rr.Registrar, state_dir: Path) -> Iterator[Consumer]:
-    """What loads, in the application or in a client of it."""
+    """What loads, in the application or in a connection of it."""
     if request.param == "registrar":
         yield app
         return
     request.getfixturevalue("runtime_dir")
-    with rr.connect(state_dir) as client:
-        yield client.open_registrar("worker")
+    with rr.connect(state_dir) as connection:
+        yield connection.open_registrar("worker")
 
 
 # -- the query of a status -----------------------------------------------------------------------------------------
@@ -360,7 +360,7 @@ def test_what_waits_for_the_callback_before_is_heard_by_the_new_one_in_order(
     assert kinds.begun.items == ["0"]
 
 
-@pytest.mark.parametrize("kind", ["registrar", "client"])
+@pytest.mark.parametrize("kind", ["registrar", "connection"])
 def test_an_async_callback_runs_on_the_event_loop_that_has_set_it(
     system: rr.System, app: rr.Registrar, provider: rr.Registrar, runtime_dir: Path, state_dir: Path, kind: str
 ) -> None:
@@ -381,8 +381,8 @@ def test_an_async_callback_runs_on_the_event_loop_that_has_set_it(
         assert loops == [asyncio.get_running_loop()]
         await query.unload_async()
 
-    with rr.connect(state_dir) as client:
-        asyncio.run(program(client.open_registrar() if kind == "client" else app))
+    with rr.connect(state_dir) as connection:
+        asyncio.run(program(connection.open_registrar() if kind == "connection" else app))
 
 
 @pytest.mark.parametrize("new", ["other", "other_async"])

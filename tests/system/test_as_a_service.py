@@ -127,10 +127,10 @@ def test_run_finds_the_tree_and_what_is_beside_it(project: Path, tmp_path: Path,
     state = cwd / "state"
     with subprocess.Popen(command, cwd=cwd, env=environment, stderr=subprocess.PIPE, text=True) as running:
         try:
-            with rr.connect(state, wait_s=LIMIT_S) as client:
-                assert client.system == "robot"  # as its tree
-                client.wait_for("part")
-                said = client.proxy("part").read().get(timeout=LIMIT_S)
+            with rr.connect(state, wait_s=LIMIT_S) as connection:
+                assert connection.system == "robot"  # as its tree
+                connection.wait_for("part")
+                said = connection.proxy("part").read().get(timeout=LIMIT_S)
                 assert said == ("beside the tree" if tree.endswith("toml") else "")
         finally:
             running.send_signal(signal.SIGTERM)

@@ -267,7 +267,7 @@ def test_a_group_that_is_unloaded_waits_once_for_a_provider_that_is_stopped(star
     assert len(caught.value.__notes__) == 19
 
 
-@pytest.mark.parametrize("kind", ["own", "handle", "client"])
+@pytest.mark.parametrize("kind", ["own", "handle", "connection"])
 def test_a_load_whose_future_is_awaited_no_more_is_withdrawn(
     start: Callable[..., rr.System], state_dir: Path, kind: str
 ) -> None:
@@ -280,8 +280,8 @@ def test_a_load_whose_future_is_awaited_no_more_is_withdrawn(
         with pytest.raises(TimeoutError):
             await asyncio.wait_for(registrar.load("provider/slow", "x", block=False), 0.2)
 
-    with rr.connect(state_dir) as client:
-        makes = {"own": system.open_registrar, "handle": system.registrar, "client": client.open_registrar}
+    with rr.connect(state_dir) as connection:
+        makes = {"own": system.open_registrar, "handle": system.registrar, "connection": connection.open_registrar}
         asyncio.run(program(makes[kind]("things")))
         gate.wait_arrived()
         gate.open()
@@ -327,7 +327,7 @@ def test_a_load_whose_future_is_shielded_goes_on(app: rr.Registrar, provider: rr
 WHO = contextvars.ContextVar("WHO", default="nobody")
 
 
-@pytest.mark.parametrize("kind", ["own", "group", "client"])
+@pytest.mark.parametrize("kind", ["own", "group", "connection"])
 def test_an_async_status_callback_runs_on_the_loop_that_awaited_the_load(
     app: rr.Registrar, provider: rr.Registrar, state_dir: Path, kind: str
 ) -> None:
@@ -350,8 +350,8 @@ def test_an_async_status_callback_runs_on_the_loop_that_awaited_the_load(
         assert heard == [(asyncio.get_running_loop(), "me", "old")]
         await query.unload_async()
 
-    with rr.connect(state_dir) as client:
-        asyncio.run(program(client.open_registrar() if kind == "client" else app))
+    with rr.connect(state_dir) as connection:
+        asyncio.run(program(connection.open_registrar() if kind == "connection" else app))
 
 
 def test_an_async_status_callback_does_not_begin_after_the_end_of_the_query(
@@ -476,14 +476,14 @@ def test_load_in_an_event_loop_says_once_that_it_blocks_it(app: rr.Registrar, pr
     asyncio.run(program())
 
 
-def test_a_load_by_a_handle_or_a_client_in_an_event_loop_says_so_too(
+def test_a_load_by_a_handle_or_a_connection_in_an_event_loop_says_so_too(
     start: Callable[..., rr.System], state_dir: Path, runtime_dir: Path
 ) -> None:
     system = start(rr.ChildSpec(Things, id="things"))
 
     async def program() -> None:
-        with rr.connect(state_dir) as client:
-            for registrar in (system.registrar("things"), client.open_registrar("worker")):
+        with rr.connect(state_dir) as connection:
+            for registrar in (system.registrar("things"), connection.open_registrar("worker")):
                 with pytest.warns(RuntimeWarning, match=r"load\(\) blocks the event loop") as heard:
                     registrar.load("things/thing", "x")
                 assert heard[0].filename == __file__

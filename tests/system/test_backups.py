@@ -610,10 +610,10 @@ def test_the_commands_back_a_running_system_up_and_bring_it_back(
 
 def test_a_connected_program_has_the_system_back_itself_up(running: rr.System, state_dir: Path, tmp_path: Path) -> None:
     running.open_registrar("app").load("tops/top", "x")
-    with rr.connect(state_dir) as client:
-        backup = client.backup(tmp_path / "backup")
+    with rr.connect(state_dir) as connection:
+        backup = connection.backup(tmp_path / "backup")
         with pytest.raises(ConfigError, match="expected a new or an empty directory"):
-            client.backup(tmp_path / "backup")
+            connection.backup(tmp_path / "backup")
     assert set(backup.registrars) == NAMES
 
 

@@ -1,4 +1,4 @@
-"""client.proxy() and `rr-actors call`: what an actor's methods do, everybody of the user can ask from outside."""
+"""connection.proxy() and `rr-actors call`: what an actor's methods do, everybody of the user can ask from outside."""
 
 from __future__ import annotations
 
@@ -69,40 +69,40 @@ def system(rr_system: Start) -> rr.System:
 
 
 @pytest.fixture
-def client(system: rr.System) -> Iterator[rr.Client]:
-    with rr.connect(system.state_dir) as client:
-        yield client
+def connection(system: rr.System) -> Iterator[rr.Connection]:
+    with rr.connect(system.state_dir) as connection:
+        yield connection
 
 
-def test_a_client_calls_a_method_and_gets_plain_data(client: rr.Client) -> None:
-    tanks = client.proxy("tanks")
+def test_a_connection_calls_a_method_and_gets_plain_data(connection: rr.Connection) -> None:
+    tanks = connection.proxy("tanks")
     assert tanks.fill(2.5).get(timeout=LIMIT_S) == 5.0
     assert tanks.fill(amount=1, into="right").get(timeout=LIMIT_S) == 2
     assert tanks.level().get(timeout=LIMIT_S) == [{"name": "left", "mode": "fast"}]
 
 
-def test_a_ready_made_manager_is_changed_from_outside(client: rr.Client) -> None:
-    budgets = client.proxy("budgets")
+def test_a_ready_made_manager_is_changed_from_outside(connection: rr.Connection) -> None:
+    budgets = connection.proxy("budgets")
     budgets.set_capacity("watts", 60).get(timeout=LIMIT_S)
     (pool,) = budgets.pools().get(timeout=LIMIT_S)
     assert (pool["name"], pool["capacity"]) == ("watts", 60.0)
 
 
-def test_a_proxy_shows_the_methods_and_no_callbacks_or_hooks(client: rr.Client) -> None:
-    assert dir(client.proxy("tanks")) == ["fill", "level", "odd"]
-    assert dir(client.proxy("pumps")) == ["level", "odd"]
-    assert repr(client.proxy("tanks")) == "<ClientProxy of tanks>"
+def test_a_proxy_shows_the_methods_and_no_callbacks_or_hooks(connection: rr.Connection) -> None:
+    assert dir(connection.proxy("tanks")) == ["fill", "level", "odd"]
+    assert dir(connection.proxy("pumps")) == ["level", "odd"]
+    assert repr(connection.proxy("tanks")) == "<ConnectedProxy of tanks>"
 
 
 @pytest.mark.parametrize("method", ["open_tank", "close_tank", "stop", "on_stop", "registrar"])
-def test_what_is_no_method_of_its_own_is_refused(client: rr.Client, method: str) -> None:
+def test_what_is_no_method_of_its_own_is_refused(connection: rr.Connection, method: str) -> None:
     with pytest.raises(rr.NotFound, match=f"no method '{method}' that may be called from outside") as info:
-        getattr(client.proxy("tanks"), method)().get(timeout=LIMIT_S)
+        getattr(connection.proxy("tanks"), method)().get(timeout=LIMIT_S)
     assert info.value.known == ("fill", "level", "odd")
 
 
-def test_wrong_calls_say_what_was_expected(client: rr.Client) -> None:
-    tanks = client.proxy("tanks")
+def test_wrong_calls_say_what_was_expected(connection: rr.Connection) -> None:
+    tanks = connection.proxy("tanks")
     with pytest.raises(rr.UsageError, match=r"fill\(amount: float, into: str = 'left'\) -> float: missing"):
         tanks.fill().get(timeout=LIMIT_S)
     with pytest.raises(rr.NotFound, match="did you mean 'level'"):
@@ -112,7 +112,7 @@ def test_wrong_calls_say_what_was_expected(client: rr.Client) -> None:
     with pytest.raises(rr.NotSerializable, match="answer of tanks"):
         tanks.odd().get(timeout=LIMIT_S)
     with pytest.raises(rr.NotFound, match="tank5"):
-        client.proxy("tank5").fill(1).get(timeout=LIMIT_S)
+        connection.proxy("tank5").fill(1).get(timeout=LIMIT_S)
     with pytest.raises(rr.RrError, match="tanks: ValueError: left cannot be filled with -1"):
         tanks.fill(-1).get(timeout=LIMIT_S)
     with pytest.raises(AttributeError):

@@ -77,7 +77,7 @@ def eager() -> asyncio.AbstractEventLoop:
     return loop
 
 
-@pytest.mark.parametrize("kind", ["own", "handle", "client"])
+@pytest.mark.parametrize("kind", ["own", "handle", "connection"])
 @pytest.mark.parametrize("new_loop", [asyncio.new_event_loop, uvloops, eager])
 @pytest.mark.parametrize("count", [100, pytest.param(3400, marks=pytest.mark.slow)])
 def test_awaited_calls_that_are_cancelled_at_random_leave_nothing(
@@ -107,9 +107,9 @@ def test_awaited_calls_that_are_cancelled_at_random_leave_nothing(
             await asyncio.gather(*[cancelled(call, chance) for call in calls])
         assert asyncio.all_tasks() == {asyncio.current_task()}
 
-    with warnings.catch_warnings(), rr.connect(state_dir) as client:
+    with warnings.catch_warnings(), rr.connect(state_dir) as connection:
         warnings.simplefilter("error")
-        makes = {"own": system.open_registrar, "handle": system.registrar, "client": client.open_registrar}
+        makes = {"own": system.open_registrar, "handle": system.registrar, "connection": connection.open_registrar}
         registrar: Any = makes[kind]("holder")
         with asyncio.Runner(loop_factory=new_loop) as runner:
             runner.run(program(registrar))

@@ -13,7 +13,7 @@ import pytest
 import rr_actors as rr
 import support_clocks
 from rr_actors.managers import Programs, Ready, RunProgram
-from rr_actors.system.console.console_client import ConsoleClient, find_console
+from rr_actors.system.console.console_connection import ConsoleConnection, find_console
 from support import Workshop, child, eventually, kill, pid_of, wait_respawned
 
 Start = Callable[..., rr.System]
@@ -121,7 +121,7 @@ def test_ages_that_are_shown_are_those_of_a_clock_that_nobody_sets(
     clock(3650 * DAY_S)
     children: list[Any] = system.supervisor().describe()["children"]
     assert all(0 <= each["up_s"] < 60 for each in children)
-    with ConsoleClient(find_console(state_dir)) as console:
+    with ConsoleConnection(find_console(state_dir)) as console:
         rows = console.children().rows
     assert all(row.up_s is None or 0 <= row.up_s < 60 for row in rows)
 

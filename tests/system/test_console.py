@@ -22,7 +22,6 @@ from rr_actors.base.errors import ConfigError, NotFound, NotRunning, RrError, Un
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.pages import ResourceRow, RowPage, Wanted
 from rr_actors.system.console import console_feed, console_view
-from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_commands import (
     Kill,
     Load,
@@ -33,6 +32,7 @@ from rr_actors.system.console.console_commands import (
     Terminate,
     Unload,
 )
+from rr_actors.system.console.console_connection import ConsoleConnection, find_console
 from rr_actors.system.console.console_messages import Entries, Events, Follow, Letters, Missed, Resources
 from rr_actors.system.console.console_questions import Find, ListDeadLetters, ListHistory, ListResources
 from rr_actors.system.console.running_systems import running_systems
@@ -54,22 +54,22 @@ def shop(start: Start, workshop: Workshop) -> rr.System:
 
 
 @pytest.fixture
-def console(request: pytest.FixtureRequest, state_dir: Path) -> Iterator[ConsoleClient]:
-    """A client of the system that the test has started before: ask for `shop` or `system` first."""
-    with ConsoleClient(find_console(state_dir)) as client:
-        yield client
+def console(request: pytest.FixtureRequest, state_dir: Path) -> Iterator[ConsoleConnection]:
+    """A connection of the system that the test has started before: ask for `shop` or `system` first."""
+    with ConsoleConnection(find_console(state_dir)) as connection:
+        yield connection
 
 
 @pytest.fixture
 def follow(state_dir: Path) -> Iterator[Callable[[Follow], Calls]]:
     """Follow the events: what comes is in the Calls that is returned."""
-    clients: list[ConsoleClient] = []
+    connections: list[ConsoleConnection] = []
     threads: list[threading.Thread] = []
 
     def begin(wanted: Follow) -> Calls:
-        heard, client = Calls(), ConsoleClient(find_console(state_dir))
-        feed = client.follow(wanted)
-        clients.append(client)
+        heard, connection = Calls(), ConsoleConnection(find_console(state_dir))
+        feed = connection.follow(wanted)
+        connections.append(connection)
 
         def read() -> None:
             for part in feed:
@@ -81,8 +81,8 @@ def follow(state_dir: Path) -> Iterator[Callable[[Follow], Calls]]:
         return heard
 
     yield begin
-    for client in clients:
-        client.close()
+    for connection in connections:
+        connection.close()
     for thread in threads:
         thread.join(5.0)
 
@@ -115,9 +115,9 @@ def test_without_the_console_there_is_no_socket_and_no_entry(start: Start, state
 
 
 def test_the_one_running_system_is_found_without_its_directory(system: rr.System, state_dir: Path) -> None:
-    with ConsoleClient(find_console()) as client:
-        assert client.welcome.pid == os.getpid()
-        assert client.welcome.state_dir == str(state_dir)
+    with ConsoleConnection(find_console()) as connection:
+        assert connection.welcome.pid == os.getpid()
+        assert connection.welcome.state_dir == str(state_dir)
 
 
 def test_of_several_running_systems_each_is_named(start: Start, tmp_path: Path) -> None:
@@ -126,8 +126,8 @@ def test_of_several_running_systems_each_is_named(start: Start, tmp_path: Path) 
 
     with pytest.raises(UsageError, match=r"several systems run: .*one, .*two; choose one with --state"):
         find_console()
-    with ConsoleClient(find_console(tmp_path / "two")) as client:
-        assert client.welcome.state_dir.endswith("two")
+    with ConsoleConnection(find_console(tmp_path / "two")) as connection:
+        assert connection.welcome.state_dir.endswith("two")
 
 
 def test_what_a_killed_system_left_in_the_list_is_not_found_and_the_next_one_removes_it(
@@ -196,13 +196,13 @@ def test_a_socket_that_was_removed_is_made_again(system: rr.System, state_dir: P
 
     node.dispatcher.run(node.keeper.look())
 
-    client: Any = eventually(lambda: _client_or_none(state_dir))
-    client.close()
+    connection: Any = eventually(lambda: _connection_or_none(state_dir))
+    connection.close()
 
 
-def _client_or_none(state_dir: Path) -> ConsoleClient | None:
+def _connection_or_none(state_dir: Path) -> ConsoleConnection | None:
     try:
-        return ConsoleClient(find_console(state_dir))
+        return ConsoleConnection(find_console(state_dir))
     except Unavailable:
         return None
 
@@ -210,7 +210,7 @@ def _client_or_none(state_dir: Path) -> ConsoleClient | None:
 # -- looking ---------------------------------------------------------------------------------------------------------
 
 
-def test_the_tree_has_each_child_with_its_process_state_and_uptime(shop: rr.System, console: ConsoleClient) -> None:
+def test_the_tree_has_each_child_with_its_process_state_and_uptime(shop: rr.System, console: ConsoleConnection) -> None:
     rows = {row.path: row for row in console.children().rows}
     pid = shop.supervisor("inner").which_child("shop").pid if "root" in rows else shop.ref("shop").pid
 
@@ -226,13 +226,13 @@ def test_a_supervisor_that_is_stopped_is_shown_as_such(start: Start, state_dir: 
     system = start(rr.Supervisor([], id="inner"), rr.Supervisor([], id="other"))
     system.supervisor().terminate_child("inner")
 
-    with ConsoleClient(find_console(state_dir)) as client:
-        rows = {row.path: row.state for row in client.children().rows}
+    with ConsoleConnection(find_console(state_dir)) as connection:
+        rows = {row.path: row.state for row in connection.children().rows}
 
     assert rows == {"root": "running", "root/inner": "stopped", "root/other": "running"}
 
 
-def test_registrars_are_listed_with_their_servers_and_counts(shop: rr.System, console: ConsoleClient) -> None:
+def test_registrars_are_listed_with_their_servers_and_counts(shop: rr.System, console: ConsoleConnection) -> None:
     app = shop.open_registrar("app")
     app.load("shop/thing", Order("a"))
 
@@ -244,7 +244,7 @@ def test_registrars_are_listed_with_their_servers_and_counts(shop: rr.System, co
 
 
 def test_a_page_has_the_rows_that_are_visible_and_how_many_there_are(
-    system: rr.System, app: rr.Registrar, served: Served, console: ConsoleClient
+    system: rr.System, app: rr.Registrar, served: Served, console: ConsoleConnection
 ) -> None:
     app.load_all([("provider/thing", f"item {number:03}") for number in range(700)])
 
@@ -258,7 +258,7 @@ def test_a_page_has_the_rows_that_are_visible_and_how_many_there_are(
 
 
 def test_a_page_over_several_registrars_has_their_rows_in_order_wherever_it_begins_and_ends(
-    system: rr.System, app: rr.Registrar, console: ConsoleClient
+    system: rr.System, app: rr.Registrar, console: ConsoleConnection
 ) -> None:
     for name, count in (("a", 3), ("b", 0), ("c", 4)):
         serve(system.open_registrar(name), "thing")
@@ -274,7 +274,7 @@ def test_a_page_over_several_registrars_has_their_rows_in_order_wherever_it_begi
 
 
 def test_a_sorted_page_over_several_registrars_has_the_most_first_wherever_it_begins_and_ends(
-    system: rr.System, app: rr.Registrar, console: ConsoleClient
+    system: rr.System, app: rr.Registrar, console: ConsoleConnection
 ) -> None:
     other, expected = system.open_registrar("other"), list[tuple[str, str, int, int]]()
     for name, count in (("a", 3), ("b", 2), ("c", 4)):
@@ -310,7 +310,7 @@ def test_a_sorted_page_over_several_registrars_has_the_most_first_wherever_it_be
 
 
 def test_resources_are_chosen_by_state_and_holder_where_they_are(
-    system: rr.System, app: rr.Registrar, provider: rr.Registrar, console: ConsoleClient
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, console: ConsoleConnection
 ) -> None:
     serve(provider, "thing")
     dirty, clean = (app.load("provider/thing", name) for name in ("dirty", "clean"))
@@ -335,7 +335,7 @@ def test_a_list_waits_once_for_all_managers_that_do_not_answer(
     system = start(*(rr.ChildSpec(Shop, id=name, args=(str(workshop.root),)) for name in names))
     system.open_registrar("app").load("shop0/thing", Order("a"))
     pids = [pid_of(system, name) for name in names[1:]]
-    with ConsoleClient(find_console(state_dir)) as console:
+    with ConsoleConnection(find_console(state_dir)) as console:
         for pid in pids:
             hang(pid)
         begun = time.monotonic()
@@ -353,7 +353,7 @@ def test_a_list_waits_once_for_all_managers_that_do_not_answer(
 
 
 def test_a_search_finds_what_a_request_says_and_not_the_bytes_around_it(
-    app: rr.Registrar, provider: rr.Registrar, console: ConsoleClient
+    app: rr.Registrar, provider: rr.Registrar, console: ConsoleConnection
 ) -> None:
     serve(provider, "shelf")
     letters = {"room": "A"}, 'an "A"', "x" * 500 + "A"
@@ -370,7 +370,7 @@ def test_a_search_finds_what_a_request_says_and_not_the_bytes_around_it(
 
 
 def test_a_resource_is_found_by_its_id_or_the_beginning_of_it_with_its_holders_and_parts(
-    shop: rr.System, console: ConsoleClient
+    shop: rr.System, console: ConsoleConnection
 ) -> None:
     app = shop.open_registrar("app")
     query = app.load("shop/thing", Order("whole", ("shop/thing:part",)))
@@ -388,7 +388,7 @@ def test_a_resource_is_found_by_its_id_or_the_beginning_of_it_with_its_holders_a
 
 
 def test_resources_are_listed_also_if_their_statuses_are_together_too_long_for_an_answer(
-    system: rr.System, app: rr.Registrar, provider: rr.Registrar, console: ConsoleClient
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, console: ConsoleConnection
 ) -> None:
     serve(provider, "thing")
     long = "\N{BELL}" * 9_000
@@ -401,7 +401,7 @@ def test_resources_are_listed_also_if_their_statuses_are_together_too_long_for_a
 
 
 def test_resources_have_room_in_an_answer_beside_the_notes_on_registrars_that_do_not_answer(
-    system: rr.System, app: rr.Registrar, provider: rr.Registrar, console: ConsoleClient,
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, console: ConsoleConnection,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     serve(provider, "thing")
@@ -421,7 +421,7 @@ def test_resources_have_room_in_an_answer_beside_the_notes_on_registrars_that_do
     assert found.notes == [f"Unavailable: {longer}"]
 
 
-def test_the_history_of_a_child_tells_of_its_exits(shop: rr.System, console: ConsoleClient) -> None:
+def test_the_history_of_a_child_tells_of_its_exits(shop: rr.System, console: ConsoleConnection) -> None:
     assert shop.ref("shop").kill()
 
     def restarted() -> bool:
@@ -437,14 +437,14 @@ def test_a_child_that_runs_and_of_which_no_event_is_kept_has_an_empty_history(
     monkeypatch.setattr(console_view, "_HISTORY", 1)
     start(rr.Supervisor([rr.ChildSpec(rr.Actor, id=id, placement="thread") for id in ("older", "newer")], id="root"))
 
-    with ConsoleClient(find_console(state_dir)) as client:
-        assert [event.path for event in client.ask(ListHistory("root")).events] == ["root/newer"]
-        assert client.ask(ListHistory("older")).events == []
+    with ConsoleConnection(find_console(state_dir)) as connection:
+        assert [event.path for event in connection.ask(ListHistory("root")).events] == ["root/newer"]
+        assert connection.ask(ListHistory("older")).events == []
         with pytest.raises(NotFound, match="'nobody': there is no child of this path or id"):
-            client.ask(ListHistory("nobody"))
+            connection.ask(ListHistory("nobody"))
 
 
-def test_dead_letters_are_counted_and_shown(system: rr.System, console: ConsoleClient) -> None:
+def test_dead_letters_are_counted_and_shown(system: rr.System, console: ConsoleConnection) -> None:
     ref = rr.Actor.start()
     ref.stop()
     with pytest.raises(rr.ActorDeadError):
@@ -454,7 +454,7 @@ def test_dead_letters_are_counted_and_shown(system: rr.System, console: ConsoleC
     assert "too late" in letters.letters[-1].message
 
 
-def _letters(console: ConsoleClient) -> Letters | None:
+def _letters(console: ConsoleConnection) -> Letters | None:
     letters = console.ask(ListDeadLetters())
     return letters if letters.count else None
 
@@ -463,7 +463,7 @@ def _letters(console: ConsoleClient) -> Letters | None:
 
 
 def test_what_is_loaded_is_let_go_again_unless_it_is_kept(
-    system: rr.System, provider: rr.Registrar, console: ConsoleClient
+    system: rr.System, provider: rr.Registrar, console: ConsoleConnection
 ) -> None:
     served = serve(provider, "thing")
 
@@ -480,7 +480,7 @@ def test_what_is_loaded_is_let_go_again_unless_it_is_kept(
 
 
 def test_of_a_response_that_is_too_long_for_an_answer_the_beginning_is_shown_and_the_load_is_no_failure(
-    system: rr.System, provider: rr.Registrar, console: ConsoleClient
+    system: rr.System, provider: rr.Registrar, console: ConsoleConnection
 ) -> None:
     serve(provider, "map", load=lambda request: "x" * 5_000_000)
 
@@ -490,7 +490,7 @@ def test_of_a_response_that_is_too_long_for_an_answer_the_beginning_is_shown_and
     assert "released" in console.ask(Unload(kept.facts["query_id"])).text
 
 
-def test_what_is_loaded_in_a_registrars_name_is_held_by_it(shop: rr.System, console: ConsoleClient) -> None:
+def test_what_is_loaded_in_a_registrars_name_is_held_by_it(shop: rr.System, console: ConsoleConnection) -> None:
     app = shop.open_registrar("app")
 
     console.ask(Load("shop/thing", '{"name": "a"}', holder="app", keep=True))
@@ -504,14 +504,14 @@ def test_a_console_that_leaves_while_it_loads_holds_nothing(
     system: rr.System, provider: rr.Registrar, state_dir: Path, gate: Gate
 ) -> None:
     served = serve(provider, "slow", load=lambda request: gate(request))
-    client = ConsoleClient(find_console(state_dir))
-    loading = Background(lambda: client.ask(Load("provider/slow", "1", keep=True)))
+    connection = ConsoleConnection(find_console(state_dir))
+    loading = Background(lambda: connection.ask(Load("provider/slow", "1", keep=True)))
     gate.wait_arrived()
-    client.close()
+    connection.close()
     with pytest.raises(NotRunning):
         loading.result()
     console = console_of(system)
-    eventually(lambda: not console.connections)
+    eventually(lambda: not console.sockets)
 
     gate.open()
 
@@ -526,8 +526,8 @@ def test_the_first_loads_of_two_consoles_at_once_both_succeed(
     done = Calls()
 
     def load(number: int) -> None:
-        with ConsoleClient(find_console(state_dir)) as client:
-            done(client.ask(Load("provider/thing", str(number), keep=True)))
+        with ConsoleConnection(find_console(state_dir)) as connection:
+            done(connection.ask(Load("provider/thing", str(number), keep=True)))
 
     threads = [threading.Thread(target=load, args=(number,)) for number in range(8)]
     for thread in threads:
@@ -550,7 +550,7 @@ def test_the_first_loads_of_two_consoles_at_once_both_succeed(
     ],
 )
 def test_a_load_that_cannot_be_says_why(
-    shop: rr.System, console: ConsoleClient, server: str, request_: str, error: type[RrError], words: str
+    shop: rr.System, console: ConsoleConnection, server: str, request_: str, error: type[RrError], words: str
 ) -> None:
     with pytest.raises(error, match=words):
         console.ask(Load(server, request_))
@@ -558,7 +558,7 @@ def test_a_load_that_cannot_be_says_why(
 
 
 def test_a_resource_is_only_taken_away_by_force(
-    system: rr.System, app: rr.Registrar, served: Served, provider: rr.Registrar, console: ConsoleClient
+    system: rr.System, app: rr.Registrar, served: Served, provider: rr.Registrar, console: ConsoleConnection
 ) -> None:
     (info,) = provider.resources()
     other = app.load("provider/thing", "x")
@@ -572,7 +572,7 @@ def test_a_resource_is_only_taken_away_by_force(
 
 
 def test_a_status_reaches_the_holders(
-    system: rr.System, app: rr.Registrar, provider: rr.Registrar, console: ConsoleClient
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, console: ConsoleConnection
 ) -> None:
     serve(provider, "thing")
     heard = Calls()
@@ -585,7 +585,7 @@ def test_a_status_reaches_the_holders(
     assert (status.state, status.message) == (rr.State.WARNING, "it is hot")
 
 
-def test_a_child_is_killed_and_comes_back(shop: rr.System, console: ConsoleClient) -> None:
+def test_a_child_is_killed_and_comes_back(shop: rr.System, console: ConsoleConnection) -> None:
     pid = shop.ref("shop").pid
 
     done = console.ask(Kill("shop"))
@@ -597,11 +597,14 @@ def test_a_child_is_killed_and_comes_back(shop: rr.System, console: ConsoleClien
 def test_a_child_in_a_thread_is_not_killed(start: Start, state_dir: Path) -> None:
     start(rr.ChildSpec(rr.Actor, id="here", placement="thread"))
 
-    with ConsoleClient(find_console(state_dir)) as client, pytest.raises(UsageError, match="terminate it instead"):
-        client.ask(Kill("here"))
+    with (
+        ConsoleConnection(find_console(state_dir)) as connection,
+        pytest.raises(UsageError, match="terminate it instead"),
+    ):
+        connection.ask(Kill("here"))
 
 
-def test_a_child_is_stopped_and_started_again(shop: rr.System, console: ConsoleClient) -> None:
+def test_a_child_is_stopped_and_started_again(shop: rr.System, console: ConsoleConnection) -> None:
     pid = shop.ref("shop").pid
     assert pid is not None
 
@@ -616,7 +619,7 @@ def test_a_child_is_stopped_and_started_again(shop: rr.System, console: ConsoleC
     assert not lives(done.facts["pid"])
 
 
-def test_a_child_is_added_from_a_toml_text(shop: rr.System, workshop: Workshop, console: ConsoleClient) -> None:
+def test_a_child_is_added_from_a_toml_text(shop: rr.System, workshop: Workshop, console: ConsoleConnection) -> None:
     spec = f'actor = "support_managers:Shop"\nid = "second"\nargs = ["{workshop.root}"]\n'
 
     done = console.ask(StartChild(spec))
@@ -635,13 +638,13 @@ def test_a_child_is_added_from_a_toml_text(shop: rr.System, workshop: Workshop, 
     ],
 )
 def test_a_wrong_specification_is_refused_and_names_its_file(
-    shop: rr.System, console: ConsoleClient, spec: str, words: str
+    shop: rr.System, console: ConsoleConnection, spec: str, words: str
 ) -> None:
     with pytest.raises(ConfigError, match=f"shop.toml.*{words}"):
         console.ask(StartChild(spec, file="shop.toml"))
 
 
-def test_dry_runs_change_nothing(shop: rr.System, workshop: Workshop, console: ConsoleClient) -> None:
+def test_dry_runs_change_nothing(shop: rr.System, workshop: Workshop, console: ConsoleConnection) -> None:
     app = shop.open_registrar("app")
     query = app.load("shop/thing", Order("a"))
     before = workshop.lines()
@@ -664,7 +667,7 @@ def test_dry_runs_change_nothing(shop: rr.System, workshop: Workshop, console: C
     assert app.queries() == [query]
 
 
-def test_what_is_not_there_is_named_with_what_is(shop: rr.System, console: ConsoleClient) -> None:
+def test_what_is_not_there_is_named_with_what_is(shop: rr.System, console: ConsoleConnection) -> None:
     with pytest.raises(NotFound, match="shop"):
         console.ask(Kill("inner/shp"))
     with pytest.raises(UnknownQuery, match="nobody holds"):
@@ -676,8 +679,8 @@ def test_what_is_not_there_is_named_with_what_is(shop: rr.System, console: Conso
 def test_a_system_that_is_shut_down_has_stopped_in_order(start: Start, workshop: Workshop, state_dir: Path) -> None:
     system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
     system.open_registrar("app").load("shop/thing", Order("a"))
-    with ConsoleClient(find_console(state_dir)) as client:
-        client.ask(ShutDown())
+    with ConsoleConnection(find_console(state_dir)) as connection:
+        connection.ask(ShutDown())
 
     assert system.wait(10.0)
     assert system.ended is not None
@@ -726,10 +729,10 @@ def test_a_reader_hears_what_it_has_asked_for(
 
 def test_when_the_last_reader_has_gone_the_system_is_not_watched_any_more(system: rr.System, state_dir: Path) -> None:
     node = node_of(system)
-    client = ConsoleClient(find_console(state_dir))
-    client.follow(Follow())
+    connection = ConsoleConnection(find_console(state_dir))
+    connection.follow(Follow())
     eventually(lambda: bool(node.watched))
-    client.close()
+    connection.close()
 
     eventually(lambda: not node.watched)
 
@@ -739,8 +742,8 @@ def test_a_reader_that_is_too_slow_hears_how_many_it_missed_and_how_the_tree_is_
 ) -> None:
     monkeypatch.setattr(console_feed, "KEPT", 100)
     console, node = console_of(shop), node_of(shop)
-    with ConsoleClient(find_console(state_dir)) as client:
-        feed = client.follow(Follow())
+    with ConsoleConnection(find_console(state_dir)) as connection:
+        feed = connection.follow(Follow())
         eventually(lambda: bool(console.feed.readers))
         big, sent = "x" * 100_000, 0
         while not next(iter(console.feed.readers)).missed:  # nobody reads: the connection fills, then the list
@@ -763,8 +766,8 @@ def test_a_reader_that_is_too_slow_hears_how_many_it_missed_and_how_the_tree_is_
 
 def test_many_long_texts_at_once_reach_a_console_that_records(system: rr.System, state_dir: Path) -> None:
     console, node, heard = console_of(system), node_of(system), Calls()
-    client = ConsoleClient(find_console(state_dir))
-    parts = client.record()
+    connection = ConsoleConnection(find_console(state_dir))
+    parts = connection.record()
 
     def read() -> None:
         for part in parts:
@@ -779,7 +782,7 @@ def test_many_long_texts_at_once_reach_a_console_that_records(system: rr.System,
         node.dispatcher.run(_publish_statuses(node, "x" * 10_000))
         eventually(lambda: len(heard) == 500)
     finally:
-        client.close()
+        connection.close()
         thread.join()
 
 
@@ -797,23 +800,23 @@ def test_a_reader_that_never_reads_holds_up_nobody(
 ) -> None:
     serve(provider, "thing")
     node = node_of(system)
-    client = ConsoleClient(find_console(state_dir))
+    connection = ConsoleConnection(find_console(state_dir))
     try:
-        client.follow(Follow())
+        connection.follow(Follow())
         eventually(lambda: bool(node.watched))
         began = time.monotonic()
         for number in range(2000):
             app.load("provider/thing", number).unload()
         assert time.monotonic() - began < 30
-        with ConsoleClient(find_console(state_dir)) as other:
+        with ConsoleConnection(find_console(state_dir)) as other:
             assert other.children().rows
     finally:
-        client.close()
+        connection.close()
 
 
 @pytest.mark.parametrize("text", ["8080", '"port":8080', "80.5", "true", "front", '["front"', "provider/th"])
 def test_a_search_finds_what_a_row_shows(
-    app: rr.Registrar, provider: rr.Registrar, console: ConsoleClient, text: str
+    app: rr.Registrar, provider: rr.Registrar, console: ConsoleConnection, text: str
 ) -> None:
     serve(provider, "thing")
     query = app.load("provider/thing", {"port": 8080, "rate": 80.5, "on": True, "names": ["front"]})
@@ -826,7 +829,7 @@ def test_a_search_finds_what_a_row_shows(
 
 
 def test_a_list_of_several_pages_has_the_notes_of_each(
-    system: rr.System, console: ConsoleClient, monkeypatch: pytest.MonkeyPatch
+    system: rr.System, console: ConsoleConnection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     row = ResourceRow("a", "a/b", "", "", "loaded", "OK", "", 1, [], 0, [], 0)
     pages = [Resources(3, [row], ["x: down"]), Resources(3, [row], ["y: down", "x: down"]), Resources(3, [row])]
@@ -843,7 +846,7 @@ def test_a_list_of_several_pages_has_the_notes_of_each(
     assert [(one.offset, one.limit) for one in asked] == [(0, 500), (1, 500), (2, 500), (0, 2), (1, 1)]
 
 
-def test_what_follows_begins_when_it_is_asked_for(system: rr.System, console: ConsoleClient) -> None:
+def test_what_follows_begins_when_it_is_asked_for(system: rr.System, console: ConsoleConnection) -> None:
     parts = console.follow(Follow(["loaded"]))
     provider = system.open_registrar("provider")
     serve(provider, "thing")

@@ -20,7 +20,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.base.folder import Folder
 from rr_actors.managers import Alternative, Choices, Choose, Chosen, Keeper, Kept
-from rr_actors.system.console.console_client import ConsoleClient, find_console
+from rr_actors.system.console.console_connection import ConsoleConnection, find_console
 from rr_actors.system.console.console_questions import ListEvents, ListHistory
 from rr_actors.system.recording import event_memory
 from rr_actors.system.recording.event_memory import FILE, OLDER, Event, EventMemory, left_events
@@ -35,8 +35,8 @@ Start = Callable[..., rr.System]
 
 
 def remembered(state_dir: Path, about: str = "") -> list[Event]:
-    with ConsoleClient(find_console(state_dir)) as client:
-        return client.ask(ListEvents(about)).events
+    with ConsoleConnection(find_console(state_dir)) as connection:
+        return connection.ask(ListEvents(about)).events
 
 
 def kinds(events: list[Event]) -> list[str]:
@@ -116,8 +116,8 @@ def test_a_manager_in_a_process_of_its_own_is_killed_and_what_happened_there_is_
 
     assert said == ["started", "status", "exited", "restarted"]
     assert kinds(remembered(state_dir, query.resource_id))[0] == "status"
-    with ConsoleClient(find_console(state_dir)) as client:
-        assert kinds(client.ask(ListHistory("shop")).events) == ["started", "exited", "restarted"]
+    with ConsoleConnection(find_console(state_dir)) as connection:
+        assert kinds(connection.ask(ListHistory("shop")).events) == ["started", "exited", "restarted"]
 
 
 SENSORS = [Alternative("range", f"sensors/{name}", "front", {"rate_hz": rate}) for name, rate in (("a", 30), ("b", 10))]

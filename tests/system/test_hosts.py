@@ -476,15 +476,15 @@ def test_the_traces_of_both_hosts_have_the_same_query(pair: Pair) -> None:
     assert traced(there, query) == {"cameras load began", "cameras load ended", "cameras>hosta/app Loaded"}
 
 
-def test_a_client_loads_from_another_host_by_its_name_and_by_a_route(pair: Pair, tmp_path: Path) -> None:
+def test_a_connection_loads_from_another_host_by_its_name_and_by_a_route(pair: Pair, tmp_path: Path) -> None:
     _, b = pair
-    with rr.connect(tmp_path / "a") as client:
-        app, heard = client.open_registrar("app"), Heard()
+    with rr.connect(tmp_path / "a") as connection:
+        app, heard = connection.open_registrar("app"), Heard()
         routed = app.load("routed/camera", "front", on_status=heard, timeout_s=LIMIT_S)
         named = app.load("hostb/cameras/camera", "front", timeout_s=LIMIT_S)
         assert (routed.server_id, named.server_id) == ("hostb/cameras/camera", "hostb/cameras/camera")
         assert routed.resource_id == named.resource_id
-        assert origins(b) == ["hosta/client.app", "hosta/client.app"]
+        assert origins(b) == ["hosta/connection.app", "hosta/connection.app"]
         b.registrar("cameras").send_status(routed.resource_id, rr.Status(rr.State.ERROR, "dark"))
         assert heard.wait() == [(rr.State.ERROR, "hostb/cameras/camera")]
         with pytest.raises(rr.UnknownHost):

@@ -20,7 +20,7 @@ import rr_actors as rr
 from rr_actors.base.errors import InvalidRequest
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.base.values.type_shapes import digest_of
-from rr_actors.system.console.console_client import ConsoleClient, find_console
+from rr_actors.system.console.console_connection import ConsoleConnection, find_console
 from rr_actors.tools.explanations import explain
 from support import TEST_PATHS, eventually
 
@@ -211,7 +211,7 @@ def test_what_waits_for_a_server_is_explained_and_cleared_with_the_server(
         provider.unregister_server("thing")
     with pytest.raises(rr.Unavailable):
         provider.unload(query.resource_id, force=True, timeout_s=0.1)
-    with ConsoleClient(find_console(system.state_dir)) as console:
+    with ConsoleConnection(find_console(system.state_dir)) as console:
         said = "\n".join(explain(console, query.resource_id))
         assert "It waits for its server 'provider/thing', which is not registered" in said
         assert "rr-actors unload --force provider/thing" in said

@@ -99,7 +99,9 @@ def test_the_patch_that_the_error_names_leaves_a_process_in_which_systems_run(
     assert ran.stdout == "open one\n", ran.stderr
 
 
-def test_an_actor_alone_is_refused_in_a_patched_process_and_a_client_works_there(tmp_path: Path, patcher: str) -> None:
+def test_an_actor_alone_is_refused_in_a_patched_process_and_a_connection_works_there(
+    tmp_path: Path, patcher: str
+) -> None:
     program = """
 PATCH()
 import rr_actors as rr
@@ -107,7 +109,7 @@ try:
     rr.Actor.start()
 except rr.UsageError as error:
     print(error)
-with rr.connect("state") as client, client.open_registrar("app").load("served/echo", "hello") as query:
+with rr.connect("state") as connection, connection.open_registrar("app").load("served/echo", "hello") as query:
     print(query.response)
 """
     with rr.System(state_dir=tmp_path / "state") as system:

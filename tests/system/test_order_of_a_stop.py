@@ -120,16 +120,16 @@ def test_a_whole_of_a_child_in_a_thread_is_unloaded_before_its_part_at_the_appli
     assert unloaded == ["map", "camera"]
 
 
-@pytest.mark.parametrize("first", ["client", "far"])
-def test_what_a_client_holds_is_released_before_its_parts_whoever_was_there_first(start: Start, first: str) -> None:
+@pytest.mark.parametrize("first", ["connection", "far"])
+def test_what_a_connection_holds_is_released_before_its_parts_whoever_was_there_first(start: Start, first: str) -> None:
     unloaded: list[str] = []
     system = start()
-    with contextlib.ExitStack() as clients:
+    with contextlib.ExitStack() as connections:
 
         def connect() -> Any:
-            return clients.enter_context(rr.connect(system.state_dir)).open_registrar("desk")
+            return connections.enter_context(rr.connect(system.state_dir)).open_registrar("desk")
 
-        desk = connect() if first == "client" else None
+        desk = connect() if first == "connection" else None
         far, me = system.open_registrar("far"), system.open_registrar("me")
         far.register_server("part", lambda request: request, lambda request, response: unloaded.append("part"))
         me.register_server(

@@ -12,8 +12,8 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.base.errors import NotFound, UsageError
-from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_commands import Kill
+from rr_actors.system.console.console_connection import ConsoleConnection, find_console
 from support import Calls, Workshop, eventually, kill
 
 Start = Callable[..., rr.System]
@@ -233,8 +233,8 @@ def test_a_dry_run_of_the_console_says_the_same(watched: Callable[[Strategy], rr
     app.load("devices/kept", "side")
     preview = system.preview(kill="devices")
 
-    with ConsoleClient(find_console(state_dir)) as client:
-        told = client.ask(Kill("devices", dry_run=True))
+    with ConsoleConnection(find_console(state_dir)) as connection:
+        told = connection.ask(Kill("devices", dry_run=True))
 
     assert all(sentence in told.text for sentence in preview.sentences())
     assert preview.sentences() == [

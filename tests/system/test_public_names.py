@@ -112,7 +112,7 @@ def _instances(system: rr.System) -> list[Any]:
         *simulated.children.values(),
         rr.experiment(rr.Supervisor([spec]), (), vary={"max_restarts": [1]}, runs=1),
     ]
-    with rr.connect(system.state_dir) as client:
-        worker = client.open_registrar(name)
-        found += [client, worker, worker.load(f"{name}/thing", 1)]
+    with rr.connect(system.state_dir) as connection:
+        worker = connection.open_registrar(name)
+        found += [connection, worker, worker.load(f"{name}/thing", 1)]
     return found

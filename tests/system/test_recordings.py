@@ -23,7 +23,7 @@ from rr_actors.base.errors import ConfigError, LoadError, NotFound, UsageError
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.links import recorder
 from rr_actors.registrar.model.recorded import Entry
-from rr_actors.system.console.console_client import ConsoleClient, find_console
+from rr_actors.system.console.console_connection import ConsoleConnection, find_console
 from rr_actors.system.console.console_messages import Entries
 from rr_actors.system.event_subscribers import Subscribers
 from rr_actors.system.recording import figures, recordings
@@ -681,8 +681,8 @@ def test_a_console_hears_what_is_recorded_and_only_while_it_listens(shops: rr.Sy
     app = shops.open_registrar("app")
     watched = node_of(shops).watched
     heard = Calls()
-    client = ConsoleClient(find_console(state_dir))
-    parts = client.record()
+    connection = ConsoleConnection(find_console(state_dir))
+    parts = connection.record()
 
     def read() -> None:
         for part in parts:
@@ -696,7 +696,7 @@ def test_a_console_hears_what_is_recorded_and_only_while_it_listens(shops: rr.Sy
     query = app.load("robots/thing", Order("r2"))
     ends = {("app", "received", "Loaded"), ("robots", "ended", "load"), ("robots", "sent", "Loaded")}
     eventually(lambda: ends <= {(one.registrar, one.event, one.name) for one in heard})
-    client.close()
+    connection.close()
     thread.join()
     eventually(lambda: watched.level[0] <= 1)
     entries = list(heard)

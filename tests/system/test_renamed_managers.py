@@ -21,7 +21,7 @@ from rr_actors.base.errors import CatalogError
 from rr_actors.managers.programs import Program, Programs, RunProgram
 from rr_actors.storage.opening import read_rows
 from rr_actors.system import registrar_lookup
-from rr_actors.system.console.console_client import ConsoleClient, find_console
+from rr_actors.system.console.console_connection import ConsoleConnection, find_console
 from support import TEST_PATHS, catalog_path, eventually
 from support_programs import running_programs
 
@@ -86,7 +86,7 @@ def test_the_dormant_one_is_named_and_a_stop_does_not_wait_for_it(
     assert "registrar programs is dormant: " in named[0]
     assert "it serves 1 x program" in named[0]
     assert "renamed_from='programs'" in named[0]
-    with ConsoleClient(find_console(system.state_dir)) as console:
+    with ConsoleConnection(find_console(system.state_dir)) as console:
         (row,) = [row for row in console.registrars().rows if row.name == "programs"]
     assert (row.status, row.error) == ("dormant", "dormant: it serves 1 x program")
     app = system.open_registrar("app")

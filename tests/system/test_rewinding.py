@@ -12,7 +12,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.base.errors import ConfigError
-from rr_actors.system.console.console_client import ConsoleClient, find_console, read_pages
+from rr_actors.system.console.console_connection import ConsoleConnection, find_console, read_pages
 from rr_actors.system.console.console_questions import ListChildren, ListResources
 from rr_actors.system.recording.recordings import Recording
 from rr_actors.system.recording.timelines import read_timeline
@@ -28,9 +28,9 @@ Told = tuple[dict[str, tuple[str, int | None]], dict[str, tuple[str, str]]]
 
 def told_live(state_dir: Path) -> Told:
     """What the console says: of each child its state and process, of each resource its state and message."""
-    with ConsoleClient(find_console(state_dir)) as client:
-        children = [row for page in read_pages(client.ask, ListChildren()) for row in page.rows]
-        resources = [row for page in read_pages(client.ask, ListResources()) for row in page.rows]
+    with ConsoleConnection(find_console(state_dir)) as connection:
+        children = [row for page in read_pages(connection.ask, ListChildren()) for row in page.rows]
+        resources = [row for page in read_pages(connection.ask, ListResources()) for row in page.rows]
     return (
         {row.path: (row.state, row.pid) for row in children},
         {f"{row.server} {row.id}": (row.condition, row.message) for row in resources},

@@ -1,4 +1,4 @@
-"""The time limit of a client's call holds while the application is stopped, whatever the client has sent before."""
+"""The time limit of a connection's call holds while the application is stopped, whatever it has sent before."""
 
 from __future__ import annotations
 
@@ -30,24 +30,24 @@ class Things(rr.Manager):
 
 
 @pytest.fixture
-def stopped(state_dir: Path) -> Iterator[tuple[rr.Client, rr.ClientRegistrar, rr.Query]]:
-    """A client, its registrar and a query, of an application that is stopped."""
+def stopped(state_dir: Path) -> Iterator[tuple[rr.Connection, rr.ConnectedRegistrar, rr.Query]]:
+    """A connection, its registrar and a query, of an application that is stopped."""
     command = [sys.executable, __file__, str(state_dir)]
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with subprocess.Popen(command, **pipes) as application:
         assert application.stdout is not None
         assert application.stdout.readline() == "up\n"
-        with rr.connect(state_dir) as client, client.open_registrar("mine") as mine:
+        with rr.connect(state_dir) as connection, connection.open_registrar("mine") as mine:
             query = mine.load("things/thing", "held")
             hang(application.pid)
-            yield client, mine, query
+            yield connection, mine, query
             os.kill(application.pid, signal.SIGCONT)
             eventually(lambda: [row.id for row in mine.queries()] in ([], [query.id]))  # what came too late is not held
         application.communicate("")
 
 
-def test_the_time_limit_of_each_call_holds(stopped: tuple[rr.Client, rr.ClientRegistrar, rr.Query]) -> None:
-    client, mine, query = stopped
+def test_the_time_limit_of_each_call_holds(stopped: tuple[rr.Connection, rr.ConnectedRegistrar, rr.Query]) -> None:
+    connection, mine, query = stopped
     late = rr.LoadTimeout
     calls: dict[str, tuple[type[Exception], Callable[[], Any]]] = {
         "load": (late, lambda: mine.load("things/thing", "x", timeout_s=LIMIT)),
@@ -59,8 +59,8 @@ def test_the_time_limit_of_each_call_holds(stopped: tuple[rr.Client, rr.ClientRe
         "by class": (rr.Unavailable, lambda: mine.load(Things.make, "d", timeout_s=LIMIT)),
         "unload": (rr.Unavailable, lambda: query.unload(timeout_s=LIMIT)),
         "unload all": (rr.Unavailable, lambda: mine.unload_all(timeout_s=LIMIT)),
-        "unload client": (rr.Unavailable, lambda: mine.unload_client("things/thing", timeout_s=LIMIT)),
-        "ask": (rr.Unavailable, lambda: client.ask("things", "hello", timeout_s=LIMIT)),
+        "unload connection": (rr.Unavailable, lambda: mine.unload_client("things/thing", timeout_s=LIMIT)),
+        "ask": (rr.Unavailable, lambda: connection.ask("things", "hello", timeout_s=LIMIT)),
     }
 
     def ended(name: str) -> str:

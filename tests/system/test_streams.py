@@ -761,20 +761,20 @@ def test_a_reader_goes_on_with_the_stream_that_a_new_response_names(start: Start
 
 @contextlib.contextmanager
 def viewing(system: rr.System) -> Iterator[Callable[[], str]]:
-    """Run a client of the system in a process of its own; yield a function that returns its next line."""
+    """Run a connection of the system in a process of its own; yield a function that returns its next line."""
     arguments = [str(system.state_dir), "cameras/camera", "a", "images"]
-    program = [sys.executable, str(TESTS / "support_stream_client.py"), *arguments]
-    with subprocess.Popen(program, stdout=subprocess.PIPE, text=True) as client:
-        assert client.stdout is not None
+    program = [sys.executable, str(TESTS / "support_stream_connection.py"), *arguments]
+    with subprocess.Popen(program, stdout=subprocess.PIPE, text=True) as connection:
+        assert connection.stdout is not None
         try:
-            assert client.stdout.readline() == "reads\n"
+            assert connection.stdout.readline() == "reads\n"
             eventually(lambda: is_wanted(system))
-            yield client.stdout.readline
+            yield connection.stdout.readline
         finally:
-            client.kill()
+            connection.kill()
 
 
-def test_a_client_in_a_process_of_its_own_reads_on_after_a_crash_of_the_manager(start: Start) -> None:
+def test_a_connection_in_a_process_of_its_own_reads_on_after_a_crash_of_the_manager(start: Start) -> None:
     system, camera = start_cameras(start, 32 * MB)
     cameras = system.ref("cameras").proxy()
     with viewing(system) as line:
@@ -792,7 +792,7 @@ def test_a_client_in_a_process_of_its_own_reads_on_after_a_crash_of_the_manager(
         assert line() == "ResourceLost\n"
 
 
-def test_the_memory_of_a_killed_client_comes_back(start: Start) -> None:
+def test_the_memory_of_a_killed_connection_comes_back(start: Start) -> None:
     system, _ = start_cameras(start, 6 * MB)
     cameras = system.ref("cameras").proxy()
     with viewing(system) as line:
@@ -810,11 +810,11 @@ def test_the_memory_of_a_killed_client_comes_back(start: Start) -> None:
         assert next(reader).value == bytes([3]) * 5 * MB
 
 
-def test_a_client_goes_on_with_the_stream_that_a_new_response_names_until_it_releases_it(start: Start) -> None:
+def test_a_connection_goes_on_with_the_stream_that_a_new_response_names_until_it_releases_it(start: Start) -> None:
     system = start(rr.ChildSpec(Boards, id="boards"), rr.ChildSpec(Robots, id="robots"))
     boards = system.ref("boards").proxy()
-    with rr.connect(system.state_dir) as client:
-        robot = client.open_registrar("viewer").load("robots/robot")
+    with rr.connect(system.state_dir) as connection:
+        robot = connection.open_registrar("viewer").load("robots/robot")
         reading = Reading(robot.stream("eyes", timeout_s=20))
         eventually(lambda: boards.publish("eyes", "of a").get() == 1)
         eventually(lambda: reading.values == ["of a"])
@@ -828,9 +828,9 @@ def test_a_client_goes_on_with_the_stream_that_a_new_response_names_until_it_rel
         assert reading.error is None
 
 
-def test_a_client_that_is_closed_ends_its_streams(system: rr.System) -> None:
-    with rr.connect(system.state_dir) as client:
-        reading = Reading(client.open_registrar("viewer").load("cameras/camera", "a").stream("images"))
+def test_a_connection_that_is_closed_ends_its_streams(system: rr.System) -> None:
+    with rr.connect(system.state_dir) as connection:
+        reading = Reading(connection.open_registrar("viewer").load("cameras/camera", "a").stream("images"))
         eventually(lambda: is_wanted(system))
 
     assert reading.ended()

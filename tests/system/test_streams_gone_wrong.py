@@ -488,8 +488,8 @@ READER = """
 import os, sys, time
 import rr_actors as rr
 
-with rr.connect(sys.argv[1]) as client:
-    reader = client.open_registrar("reader").load("boards/board", ["a"]).stream("a", keep="all", depth=2)
+with rr.connect(sys.argv[1]) as connection:
+    reader = connection.open_registrar("reader").load("boards/board", ["a"]).stream("a", keep="all", depth=2)
     if not (pid := os.fork()):
         time.sleep(600)
     print(pid, flush=True)

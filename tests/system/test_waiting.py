@@ -1,4 +1,4 @@
-"""system.wait_for(), client.wait_for() and ref.wait_running(): no test and no program has to poll."""
+"""system.wait_for(), connection.wait_for() and ref.wait_running(): no test and no program has to poll."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ def test_a_child_and_a_resource_are_waited_for_by_their_states(rr_system: Start)
     assert system.wait_for("cameras") == "running"
     system.ref("task").tell("do it, and end")
     assert system.wait_for("task", "stopped") == "stopped"
-    with rr.connect(system.state_dir) as client:
+    with rr.connect(system.state_dir) as connection:
         query = system.open_registrar("app").load(Cameras.open_camera, "front")
         assert system.wait_for('cameras/camera "front"') in ("OK", "loaded")
-        assert client.wait_for('cameras/camera "front"', "loaded") in ("OK", "loaded")
+        assert connection.wait_for('cameras/camera "front"', "loaded") in ("OK", "loaded")
         query.unload()
-        assert client.wait_for('cameras/camera "front"', "gone") == "gone"
+        assert connection.wait_for('cameras/camera "front"', "gone") == "gone"
 
 
 def test_what_does_not_come_in_time_says_what_there_is(rr_system: Start) -> None:
@@ -66,22 +66,22 @@ def test_what_does_not_come_in_time_says_what_there_is(rr_system: Start) -> None
         ref.wait_running(timeout_s=-1)
 
 
-def test_a_client_whose_system_has_ended_waits_for_none(rr_system: Start) -> None:
+def test_a_connection_whose_system_has_ended_waits_for_none(rr_system: Start) -> None:
     system = rr_system(rr.ChildSpec(Cameras, id="cameras", placement="thread"))
-    with rr.connect(system.state_dir) as client:
+    with rr.connect(system.state_dir) as connection:
         system.stop()
-        assert client.wait_for("cameras", "gone") == "gone"
+        assert connection.wait_for("cameras", "gone") == "gone"
         with pytest.raises(rr.NotRunning, match="has ended: connect to its next run"):
-            client.wait_for("cameras", timeout_s=None)
+            connection.wait_for("cameras", timeout_s=None)
 
 
-def test_a_client_that_is_closed_does_not_say_that_all_is_gone(rr_system: Start) -> None:
+def test_a_connection_that_is_closed_does_not_say_that_all_is_gone(rr_system: Start) -> None:
     system = rr_system(rr.ChildSpec(Cameras, id="cameras", placement="thread"))
-    client = rr.connect(system.state_dir)
-    client.close()
+    connection = rr.connect(system.state_dir)
+    connection.close()
     for state in ("", "gone"):
-        with pytest.raises(rr.NotRunning, match="the client is closed"):
-            client.wait_for("cameras", state, timeout_s=None)
+        with pytest.raises(rr.NotRunning, match="the connection is closed"):
+            connection.wait_for("cameras", state, timeout_s=None)
 
 
 def test_a_time_limit_by_another_name_says_which_is_meant(rr_system: Start) -> None:

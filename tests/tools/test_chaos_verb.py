@@ -17,7 +17,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.registrar.model.rows import Held, Hold, Notice, Phase, Put, Resource, Row, ServedQuery, State
 from rr_actors.storage.opening import open_store
-from rr_actors.system.console.console_client import ConsoleClient, find_console
+from rr_actors.system.console.console_connection import ConsoleConnection, find_console
 from rr_actors.system.console.console_messages import ChildRow
 from rr_actors.tools.inspection import Contents, check_delivered
 from rr_actors.tools.random_kills import KillPlan, RandomKills, missing_after
@@ -260,9 +260,9 @@ def test_catalogs_that_disagree_before_are_named_and_nothing_is_killed(shop: rr.
 
 
 def test_catalogs_that_disagree_after_a_kill_end_the_run(shop: rr.System) -> None:
-    with ConsoleClient(find_console(shop.state_dir)) as client:
+    with ConsoleConnection(find_console(shop.state_dir)) as connection:
         plan = KillPlan(kills=5, seed=1, only=("shop",), timeout_s=5.0)
-        report = RandomKills(client, plan, lambda line: spoil(shop.state_dir)).run()
+        report = RandomKills(connection, plan, lambda line: spoil(shop.state_dir)).run()
 
     assert [kill.path for kill in report.kills] == ["root/shop"]
     assert report.violations == [

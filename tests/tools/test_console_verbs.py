@@ -23,7 +23,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.registrar.pages import HOLDERS_SHOWN, ResourceRow
 from rr_actors.system.console import console_feed
-from rr_actors.system.console.console_client import ConsoleClient
+from rr_actors.system.console.console_connection import ConsoleConnection
 from rr_actors.system.console.console_messages import Children, ChildRow, Missed
 from rr_actors.system.recording.event_texts import ago
 from rr_actors.tools import graphs
@@ -125,7 +125,7 @@ def test_a_script_waits_for_a_resource_its_state_and_its_end(app: rr.Registrar) 
 def test_a_script_waits_for_the_end_of_a_system(shop: rr.System, state_dir: Path) -> None:
     ended, other = (waiting("shop", "--for", wanted, "--state", state_dir) for wanted in ("gone", "stopped"))
     with ended, other:
-        eventually(lambda: console_of(shop).clients.total() == 4)
+        eventually(lambda: console_of(shop).programs.total() == 4)
         shop.stop()
         assert ended.wait(LIMIT_S) == 0
         assert other.wait(LIMIT_S) in (0, 3)  # it may have seen the child stopped before the console ended
@@ -1249,7 +1249,7 @@ def test_a_line_about_missed_events_says_how_many_rows_the_tree_has(
     start: Start, state_dir: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     page = Children(501, [ChildRow("root", 0, "supervisor", "running")])
-    monkeypatch.setattr(ConsoleClient, "follow", lambda *_: iter([Missed(3, 9, page)]))
+    monkeypatch.setattr(ConsoleConnection, "follow", lambda *_: iter([Missed(3, 9, page)]))
     start()
     console_verbs.events(follow=True, state=state_dir, as_json=True)
     said = json.loads(capsys.readouterr().out)

@@ -15,7 +15,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.registrar.pages import HolderRow, ResourceRow, ServerRow
-from rr_actors.system.console.console_client import ConsoleClient
+from rr_actors.system.console.console_connection import ConsoleConnection
 from rr_actors.system.console.console_messages import Entries, RegistrarRow
 from rr_actors.system.console.console_questions import ListServers
 from rr_actors.tools.terminal.console_link import ConsoleLink
@@ -271,12 +271,12 @@ def reached(monkeypatch: pytest.MonkeyPatch) -> Gate:
     """Where the recorder waits when it has reached the system."""
     gate = Gate()
 
-    class Slow(ConsoleClient):
+    class Slow(ConsoleConnection):
         def record(self) -> Iterator[Entries]:
             gate()
             return super().record()
 
-    monkeypatch.setattr(sequence_page, "ConsoleClient", Slow)
+    monkeypatch.setattr(sequence_page, "ConsoleConnection", Slow)
     return gate
 
 
@@ -322,12 +322,12 @@ def test_a_page_that_is_left_while_its_recording_starts_records_nothing(
 def test_a_page_sees_that_its_recording_goes_on_when_it_is_full_and_what_it_has_missed(
     recorder: Recorder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Told(ConsoleClient):
+    class Told(ConsoleConnection):
         def record(self) -> Iterator[Entries]:
             entries = [Entry(float(number), "loaded") for number in range(3)]
             return iter([Entries(entries), Entries([], 5), Entries(entries[:1], 7)])
 
-    monkeypatch.setattr(sequence_page, "ConsoleClient", Told)
+    monkeypatch.setattr(sequence_page, "ConsoleConnection", Told)
     monkeypatch.setattr(sequence_page, "_LIMIT", 2)
     recorder.start()
 

@@ -71,7 +71,7 @@ def chain() -> Chain:
 
 @contextlib.contextmanager
 def asking_as(name: str) -> Generator[None]:
-    """Have asks within the `with` block carry this name: that of a client, which is no actor."""
+    """Have asks within the `with` block carry this name: that of a connected program, which is no actor."""
     token = activity.set(Activity(Target(f"asker:{name}", name), ()))
     try:
         yield
@@ -80,7 +80,7 @@ def asking_as(name: str) -> Generator[None]:
 
 
 def asker() -> str | None:
-    """Return the name of the actor or client that asks, "" if it is not known; None outside of a handler."""
+    """Return the name of the actor or connected program that asks, "" if it is not known; None outside of a handler."""
     me = activity.get()
     if me is None or not me.active or me.starts_in is not None:
         return None

@@ -10,7 +10,7 @@ from typing import Any
 from rr_actors.managers.actions.action_manager import RunGraph, wait_ended
 from rr_actors.managers.actions.graph_documents import read_graph_file
 from rr_actors.registrar.registrar import Registrar
-from rr_actors.system.console.connected_client import ClientRegistrar
+from rr_actors.system.console.connection import ConnectedRegistrar
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class GraphResult:
 
 
 def run_graph(
-    app: Registrar | ClientRegistrar,
+    app: Registrar | ConnectedRegistrar,
     graph: str | os.PathLike[str] | dict[str, Any],
     *,
     inputs: dict[str, Any] | None = None,
@@ -41,7 +41,7 @@ def run_graph(
     """Run a graph to its end, release it, and return how it has ended.
 
     Args:
-        app: the registrar that holds the graph meanwhile; a client's (rr.connect) may do so, too.
+        app: the registrar that holds the graph meanwhile; a connection's (rr.connect) may do so, too.
         graph: the name of a graph in the manager's folder; or a JSON file, by a path, or by a text that ends in
             ".json"; or a JSON object.
         inputs: of the entries, nested or by flat names ("nav_goal::x").

@@ -23,7 +23,7 @@ from rr_actors.base.errors import (
     UnknownRegistrar,
     counted,
 )
-from rr_actors.base.names import CLIENTS, REGISTRAR, new_id
+from rr_actors.base.names import CONNECTED, REGISTRAR, new_id
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.steps import Steps
 from rr_actors.base.values.failure import Failure
@@ -220,9 +220,9 @@ class Node(ProcessNode):
 
     def _is_gone(self, registrar: str) -> bool:
         status = self.status_of(registrar)
-        if status is not None or not registrar.startswith(CLIENTS):
+        if status is not None or not registrar.startswith(CONNECTED):
             return status is _GONE
-        # If an application is killed, its next start alone gives up its clients. Later ones find no catalog of them.
+        # If an application is killed, its next start alone gives up these. Later ones find no catalog of them.
         return not os.path.exists(self.config.registrar(registrar).catalog_path(self.info.state_dir).parent)
 
     def close_registrar(self, name: str, status: Presence | None) -> None:

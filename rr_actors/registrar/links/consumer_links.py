@@ -237,13 +237,19 @@ class Consumers:
 
         An Unload is decided behind what the thread has asked of the loop before.
         """
-        if self._provider.closed or may_be_interrupted() or not self.listens_to(hello):
+        provider = self._provider
+        if provider.closed or may_be_interrupted() or not self.listens_to(hello):
             return None
+        at = time.time() if provider.node.watched.level[0] > 1 else None
+        answer: Message | None = None
         if type(message) is Load:
-            return self._provider.join(message)
-        if type(message) is Unload and not self._provider.gathers and not self._provider.node.dispatcher.is_behind():
-            return self._provider.leave(message)
-        return None
+            answer = provider.join(message)
+        elif type(message) is Unload and not provider.gathers and not provider.node.dispatcher.is_behind():
+            answer = provider.leave(message)
+        if answer is not None and at is not None:
+            self._record("received", hello.origin, message, at)
+            self._record("sent", hello.origin, answer)
+        return answer
 
     def lost_directly(self, line: Any, _reason: Exception | None) -> None:
         """Note that a direct line is down: the consumer's link carries the answers that it waits for."""

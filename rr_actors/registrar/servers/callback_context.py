@@ -33,9 +33,9 @@ class Current(msgspec.Struct, frozen=True):
         resource_id: the resource that the callback loads, unloads, or hears about.
         attempt: 1 at first; more if a crash interrupted an earlier attempt.
         origin: the name of the registrar that holds the resource: of its present holders, the one that asked first. Of
-            a message: who asks, an actor whose handler waits for the answer, "client.NAME" as ClientRegistrar.ask()
-            says, or "client.pid-4711" of another client. "" for a tell(), an ask without waiting, and for code of no
-            handler.
+            a message: who asks, an actor whose handler waits for the answer, "connection.NAME" as
+            ConnectedRegistrar.ask() says, or "connection.pid-4711" of Connection.ask(). "" for a tell(), an
+            ask without waiting, and for code of no handler.
         server: the server's name, as it was registered.
         interrupted: in an unload callback, whether the load callback never returned; the response is None then. The
             load was withdrawn or given up after a crash. Nothing, a part or all of the resource may have been loaded.

@@ -40,7 +40,7 @@ _FINALIZERS: Any = weakref.finalize
 PRELOAD = (
     "rr_actors.supervision.child_main",
     "rr_actors.system.system",
-    "rr_actors.system.console.connected_client",
+    "rr_actors.system.console.connection",
     "rr_actors.system.recording.stream_recordings",
     "rr_actors.actors.timers",
     "multiprocessing.resource_tracker",

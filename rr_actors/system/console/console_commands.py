@@ -24,7 +24,7 @@ from rr_actors.base.errors import (
     few,
     shown,
 )
-from rr_actors.base.names import CLIENTS, check_name, parse_server_id, short_id, short_ids
+from rr_actors.base.names import CONNECTED, check_name, parse_server_id, short_id, short_ids
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.base.values.failure import error_of
 from rr_actors.registrar.arguments import LoadOptions, server_target
@@ -40,7 +40,7 @@ from rr_actors.supervision.core.specs import Supervisor, child_from_toml
 from rr_actors.supervision.supervisor import Child, SupervisorRef
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.asking import actor_calls
-from rr_actors.system.console.client_registrars import Caller
+from rr_actors.system.console.connected_registrars import Caller
 from rr_actors.system.console.console_view import REGISTRAR, Command, Verb, View
 from rr_actors.system.snapshots import preview_in
 
@@ -499,25 +499,25 @@ def _mailbox_facts(found: MailboxInfo) -> dict[str, object]:
     return {"path": found.path, "waiting": found.length, "is_paused": found.is_paused}
 
 
-# -- clients ----------------------------------------------------------------------------------------------------------
+# -- connected programs -----------------------------------------------------------------------------------------------
 
 
 class OpenRegistrar(Command[c.Done], frozen=True):
-    """Open a registrar for a client. When this connection ends, it is closed, and its queries are released.
+    """Open a registrar for a connected program. When this socket ends, it is closed, and its queries are released.
 
-    In the system it is called "client.NAME"; Done's facts have this name as `registrar`.
+    In the system it is called "connection.NAME"; Done's facts have this name as `registrar`.
     """
 
     name: c.Text
 
     def _carry_out(self, view: View, caller: Caller) -> c.Done:
-        name = check_name(CLIENTS + check_name(self.name, "registrar name"), "registrar name")
-        view.clients.open(caller, name, view.open_registrar)
+        name = check_name(CONNECTED + check_name(self.name, "registrar name"), "registrar name")
+        view.connected.open(caller, name, view.open_registrar)
         return c.Done(f"opened registrar {name}", {"registrar": name})
 
 
 class Hold(Command[c.Holding], frozen=True):
-    """Load a resource with a client's registrar, by a request's canonical bytes.
+    """Load a resource with a connected program's registrar, by a request's canonical bytes.
 
     If the connection ends, or makes another request, after the answer and before its Keep, the query is released.
     """
@@ -530,23 +530,23 @@ class Hold(Command[c.Holding], frozen=True):
     wait_s: c.Seconds | None = None
 
     def _carry_out(self, view: View, caller: Caller) -> c.Holding:
-        client = view.clients.named(self.registrar)
-        registrar = client.registrar
-        options = LoadOptions(on_status=client.hear, priority=self.priority, own=True, wait_s=self.wait_s)
+        opened = view.connected.named(self.registrar)
+        registrar = opened.registrar
+        options = LoadOptions(on_status=opened.hear, priority=self.priority, own=True, wait_s=self.wait_s)
         target = server_target(self.server, view.node)
         query = load_bytes(registrar, str(target), self.request, "", options, timeout_s=self.timeout_s)
         response = response_bytes(query)
         if len(response) > c.RESPONSE_LIMIT_BYTES:
             registrar.unload(query.id, timeout_s=self.timeout_s)
-            text = f"a response of {len(response)} bytes is over a client's limit of {c.RESPONSE_LIMIT_BYTES}"
+            text = f"a response of {len(response)} bytes is over a connection's limit of {c.RESPONSE_LIMIT_BYTES}"
             raise NotSerializable(f"{self.server}: {text}; give the name of a file, say", path="response")
-        client.watch(query, view.node)
+        opened.watch(query, view.node)
         there = str(target) if "/" in target.registrar else ""
         return c.Holding(query.id, query.resource_id, response, query.state, there)
 
 
 class Release(Command[c.Done], frozen=True):
-    """Release a query of a client's registrar, or all its queries at a server; or all, if it names neither."""
+    """Release a query of a program's registrar, or all its queries at a server; or all, if it names neither."""
 
     registrar: c.Text
     query_id: c.Text = ""
@@ -554,7 +554,7 @@ class Release(Command[c.Done], frozen=True):
     timeout_s: c.Seconds = 30.0
 
     def _carry_out(self, view: View, caller: Caller) -> c.Done:
-        registrar = view.clients.named(self.registrar).registrar
+        registrar = view.connected.named(self.registrar).registrar
         if self.query_id:
             registrar.unload(self.query_id, timeout_s=self.timeout_s)
         elif self.server:
@@ -567,19 +567,19 @@ class Release(Command[c.Done], frozen=True):
 class AwaitStatuses(Verb[c.Statuses], frozen=True):
     """Wait for statuses of the queries of the registrar that was opened by this connection. The answer has no limit.
 
-    A system that is stopping answers, too: its end is the next that the client hears.
+    A system that is stopping answers, too: its end is the next that the program hears.
     """
 
     registrar: c.Text
 
     def _carry_out(self, view: View, caller: Caller) -> c.Statuses:
-        return c.Statuses(view.clients.named(self.registrar, caller).take())
+        return c.Statuses(view.connected.named(self.registrar, caller).take())
 
 
 class AskActor(Command[c.Replied], frozen=True):
     """Ask an actor of the tree, by its path or id; the message is plain data, as canonical bytes.
 
-    `asker`: the name that the actor's handler sees, a registrar of this client or "client.pid-" and its process.
+    `asker`: the name that the actor's handler sees, a registrar of this program or "connection.pid-" and its process.
     """
 
     actor: c.Text
@@ -590,7 +590,7 @@ class AskActor(Command[c.Replied], frozen=True):
     def _carry_out(self, view: View, caller: Caller) -> c.Replied:
         message = ANY.decode(self.message, self.actor, "message")
         ref = view.system.ref(self.actor)
-        name = view.clients.asking(caller, self.asker)
+        name = view.connected.asking(caller, self.asker)
         try:
             with asking_as(name):
                 answer = ref.ask(message, timeout=self.timeout_s)
@@ -598,7 +598,7 @@ class AskActor(Command[c.Replied], frozen=True):
             text = f"{self.actor}: it has not answered within {self.timeout_s:g} s; a later answer reaches nobody"
             raise Unavailable(text) from late
         except Exception as error:
-            raise actor_calls.as_a_client_hears(self.actor, error) from error
+            raise actor_calls.as_heard_outside(self.actor, error) from error
         return c.Replied(encode(answer, f"answer of {self.actor}"))
 
 

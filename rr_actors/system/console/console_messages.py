@@ -26,7 +26,7 @@ from rr_actors.system.recording.event_memory import Event
 from rr_actors.system.recording.figures import Figure
 from rr_actors.wire.name_service import HostInfo
 
-VERSION = 7
+VERSION = 8
 SOCKET = "console.sock"
 REQUEST_LIMIT_BYTES = 2**20
 """The longest request. The longest part of any is a resource's request as JSON."""
@@ -41,7 +41,7 @@ SERVERS_LIMIT = 1000
 Text = Annotated[str, msgspec.Meta(max_length=1000)]
 Long = Annotated[str, msgspec.Meta(max_length=900_000)]
 VALUE_LIMIT_BYTES = 900_000
-"""The longest request of a resource, or message to an actor, of a client."""
+"""The longest request of a resource, or message to an actor, of a connected program."""
 Value = Annotated[bytes, msgspec.Meta(max_length=VALUE_LIMIT_BYTES)]
 Offset = Annotated[int, msgspec.Meta(ge=0, le=2**40)]
 Limit = Annotated[int, msgspec.Meta(ge=1, le=PAGE_LIMIT)]
@@ -60,13 +60,13 @@ class Message(msgspec.Struct, frozen=True, tag_field="is", tag=str.lower, omit_d
 
 
 class Hello(Message, frozen=True):
-    """The first message: the version of this protocol that the client speaks.
+    """The first message: the version of this protocol that the sender speaks.
 
-    `client`: what all connections of one client have in common; "" if this is its only one.
+    `program`: what all sockets of one rr.Connection have in common; "" if this is its only one.
     """
 
     version: int
-    client: Text = ""
+    program: Text = ""
 
 
 def mentions(facts: dict[str, Any], text: str) -> bool:
@@ -86,7 +86,7 @@ class BeginRecording(Message, frozen=True):
 
 
 class Keep(Message, frozen=True):
-    """Keep the query of the last Holding, because the client has received it. A Keep has no answer."""
+    """Keep the query of the last Holding, because the program has received it. A Keep has no answer."""
 
 
 # -- answers ---------------------------------------------------------------------------------------------------------
@@ -321,7 +321,7 @@ class Done(Message, frozen=True):
 
 
 class Holding(Message, frozen=True):
-    """The answer to Hold: the query that the client's registrar holds now, and the response's canonical bytes.
+    """The answer to Hold: the query that the program's registrar holds now, and the response's canonical bytes.
 
     server: the id of the server if that is of another host, say behind a route; "": it is the one that was asked for.
     """

@@ -14,7 +14,7 @@ from rr_actors.registrar.pages import LOAD_ORDERS, RESOURCE_ORDERS, STREAM_ORDER
 from rr_actors.registrar.registrar import has_all_streams
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.asking import actor_calls
-from rr_actors.system.console.client_registrars import Caller
+from rr_actors.system.console.connected_registrars import Caller
 from rr_actors.system.console.console_view import Look, Verb, View, room_for
 from rr_actors.system.recording.event_memory import Event
 from rr_actors.system.snapshots import ask_each
@@ -172,16 +172,16 @@ class FindServer(Verb[c.ServerFound], frozen=True):
 
 
 class HasAllStreams(Verb[c.AllStreams], frozen=True):
-    """Whether nobody will open another stream of the resource of a client's query: its manager has run since the load.
+    """Whether nobody will open another stream for a connected program's query: the manager has run since the load.
 
-    The client asks after it has looked at the streams that there are.
+    The program asks after it has looked at the streams that there are.
     """
 
     registrar: c.Text
     query_id: c.Text
 
     def _carry_out(self, view: View, caller: Caller) -> c.AllStreams:
-        return c.AllStreams(has_all_streams(view.clients.named(self.registrar).registrar, self.query_id))
+        return c.AllStreams(has_all_streams(view.connected.named(self.registrar).registrar, self.query_id))
 
 
 class ListMethods(Verb[c.Methods], frozen=True):

@@ -1,7 +1,7 @@
 """The console's socket: the server accepts consoles of this user, reads their requests, and has workers answer them.
 
-Each connection has one request in flight, and the server does not read the next requests meanwhile. So a client can
-hold at most one worker, one answer and one list of events, and the system waits for no client.
+Each connection has one request in flight, and the server does not read the next requests meanwhile. So a program can
+hold at most one worker, one answer and one list of events, and the system waits for no program.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from rr_actors.base.values.failure import failure_of
 from rr_actors.hosting.forwarded_logs import KeptLogs
 from rr_actors.registrar.engine.node import Node
 from rr_actors.system.console import console_messages as c
-from rr_actors.system.console.client_registrars import Caller
+from rr_actors.system.console.connected_registrars import Caller
 from rr_actors.system.console.console_commands import AwaitStatuses, Hold, OpenRegistrar
 from rr_actors.system.console.console_feed import Feed, Reader
 from rr_actors.system.console.console_protocol import REQUESTS, decoder_of
@@ -36,14 +36,14 @@ from rr_actors.wire.unix_sockets import Refusals, SocketDir, peer_of
 
 logger = Log("rr_actors")
 
-CONNECTIONS_LIMIT = 256
-"""The most connections of one client, and the most that have not said Hello yet; further ones are refused."""
+SOCKETS_LIMIT = 256
+"""The most sockets of one connected program, and the most that have not said Hello yet; further ones are refused."""
 FRAME_S = 5.0
-"""Seconds that a client may take for its first message, and for the rest of a message that it has begun."""
+"""Seconds that a program may take for its first message, and for the rest of a message that it has begun."""
 STALLED_S = 30.0
-"""Seconds that a client may leave an answer unread."""
+"""Seconds that a program may leave an answer unread."""
 LOOK_S = 5.0
-"""Seconds after which the server looks again whether a client has left whose requests it does not read yet."""
+"""Seconds after which the server looks again whether a program has left whose requests it does not read yet."""
 _AGAIN_S = 0.1
 
 
@@ -72,9 +72,9 @@ class Console:
         self.view = View(system, node, memory, child_logs, shut_down)
         self.feed = Feed(subscribers, recordings)
         self.welcome = c.Welcome(c.VERSION, system.name, os.getpid(), node.info.state_dir, self.view.since)
-        self.connections: set[Connection] = set()
-        self.clients: Counter[object] = Counter()  # the connections of each; of "", those that have not said Hello yet
-        self.clients_limit = node.info.config.clients_limit
+        self.sockets: set[ConsoleSocket] = set()
+        self.programs: Counter[object] = Counter()  # the sockets of each; of "", those that have not said Hello yet
+        self.connections_limit = node.info.config.connections_limit
         self.refusals = Refusals(logger)
         self.stopping = False  # then commands are refused; the feed goes on
         self._sockets = SocketDir(Path(node.info.run_dir))
@@ -100,7 +100,7 @@ class Console:
     async def _serve(self) -> None:
         listener = self._sockets.bind(c.SOCKET)
         loop = asyncio.get_running_loop()
-        made = await loop.create_unix_server(lambda: Connection(self), sock=listener, start_serving=False)
+        made = await loop.create_unix_server(lambda: ConsoleSocket(self), sock=listener, start_serving=False)
         lost, self._server = self._server, made
         if lost is not None:
             lost.close()
@@ -111,11 +111,11 @@ class Console:
         if self._server is not None and not self._sockets.has(c.SOCKET):
             self._making = asyncio.get_running_loop().create_task(self._serve())
 
-    def counted(self, client: object, change: int) -> None:
-        """Count a connection of a client that has come or gone."""
-        self.clients[client] += change
-        if not self.clients[client]:
-            del self.clients[client]
+    def counted(self, program: object, change: int) -> None:
+        """Count a socket of a program that has come or gone."""
+        self.programs[program] += change
+        if not self.programs[program]:
+            del self.programs[program]
 
     def leave_to_parent(self) -> None:
         """Give up, in a forked child, the lock that says that the parent lives."""
@@ -138,15 +138,15 @@ class Console:
         if server is not None:
             steps.take("closing the console's socket", server.close)
             steps.take("removing the console's socket", self._sockets.unlink, c.SOCKET)
-        for connection in list(self.connections):
-            steps.take("closing a console's connection", connection.end)
+        for socket in list(self.sockets):
+            steps.take("closing a console's connection", socket.end)
         steps.take("closing the directory of sockets", self._sockets.close)
         await asyncio.sleep(0)  # in its next turn the loop closes the transports that were ended
         await asyncio.sleep(0)
         steps.end("the console is not closed altogether")
 
     def answered(self, request: c.Message, caller: Caller) -> tuple[bytes, str]:
-        """Return the frame that answers a request, and the id of the query that it loaded for a client. In a worker."""
+        """Return the frame that answers a request, and the id of the query that it loaded for one. In a worker."""
         name = type(request).__name__
         try:
             if not isinstance(request, Verb):
@@ -176,8 +176,8 @@ def refusal(error: BaseException) -> bytes:
     return framed(c.Refused(failure_of(error)), c.ANSWER_LIMIT_BYTES)
 
 
-class Connection(asyncio.Protocol):
-    """The connection of one console."""
+class ConsoleSocket(asyncio.Protocol):
+    """The socket of one console."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -189,16 +189,16 @@ class Connection(asyncio.Protocol):
         self._busy = False
         self._blocked = False
         self._ended = False
-        self._looks = False  # whether the loop will look for the client
+        self._looks = False  # whether the loop will look for the program
         self._reader: Reader | None = None
         self._has_registrars = False
-        self.client: object = ""  # what all connections of one client have in common
+        self.program: object = ""  # what all sockets of one rr.Connection have in common
         self.pid = 0
         self._unheard: tuple[str, ...] = ()  # the registrar and query of the last answer, until Keep
 
     @property
     def is_gone(self) -> bool:
-        """Whether the client has left, or is being left. From any thread: the loop may not have noticed it yet."""
+        """Whether the program has left, or is being left. From any thread: the loop may not have noticed it yet."""
         poll = select.poll()
         try:
             poll.register(self._transport.get_extra_info("socket"), select.POLLRDHUP)
@@ -208,7 +208,7 @@ class Connection(asyncio.Protocol):
 
     @property
     def unread_bytes(self) -> int:
-        """How many bytes of answers wait here, because the client does not read."""
+        """How many bytes of answers wait here, because the program does not read."""
         return self._transport.get_write_buffer_size()
 
     # -- called by asyncio -------------------------------------------------------------------------------------------
@@ -222,15 +222,15 @@ class Connection(asyncio.Protocol):
             self._console.refusals.note(f"console: refused {peer}, of user {peer.uid}")
             self._transport.abort()
             self._ended = True
-        elif self._console.clients[""] >= CONNECTIONS_LIMIT:
-            self._leave(Unavailable(f"{CONNECTIONS_LIMIT} consoles are connected already that have not said Hello yet"))
+        elif self._console.programs[""] >= SOCKETS_LIMIT:
+            self._leave(Unavailable(f"{SOCKETS_LIMIT} consoles are connected already that have not said Hello yet"))
         else:
-            self._console.connections.add(self)
-            self._console.clients[""] += 1
+            self._console.sockets.add(self)
+            self._console.programs[""] += 1
             self._set_timer(FRAME_S)
 
     def data_received(self, data: bytes) -> None:
-        """Take the requests that `data` completes; refuse and disconnect a client that breaks the rules."""
+        """Take the requests that `data` completes; refuse and disconnect a program that breaks the rules."""
         if self._ended:
             return
         self._requests += self._frames.feed(data)
@@ -241,17 +241,17 @@ class Connection(asyncio.Protocol):
             self._leave(UsageError("a connection that follows the events takes no further requests: open another"))
         else:
             self._next()
-            if self._requests:  # otherwise read on, to notice a client that leaves
+            if self._requests:  # otherwise read on, to notice a program that leaves
                 self._transport.pause_reading()
                 if not self._looks:
                     self._look_later()
 
     def _look_later(self) -> None:
         self._looks = True
-        asyncio.get_running_loop().call_later(LOOK_S, self._look_for_client)
+        asyncio.get_running_loop().call_later(LOOK_S, self._look_for_program)
 
-    def _look_for_client(self) -> None:
-        """Abort the connection if the client has left: while nothing is read, the transport does not notice that."""
+    def _look_for_program(self) -> None:
+        """Abort the connection if the program has left: while nothing is read, the transport does not notice that."""
         self._looks = False
         if self._ended or self._transport.is_reading():
             return
@@ -261,12 +261,12 @@ class Connection(asyncio.Protocol):
             self._look_later()
 
     def eof_received(self) -> bool:
-        """Close the connection: the client sends no more, and its last request is not answered either."""
+        """Close the connection: the program sends no more, and its last request is not answered either."""
         self.end()
         return False
 
     def pause_writing(self) -> None:
-        """Hold back further answers and events, because the client does not read."""
+        """Hold back further answers and events, because the program does not read."""
         self._blocked = True
         if self._reader is not None:
             self._reader.is_blocked = True
@@ -274,7 +274,7 @@ class Connection(asyncio.Protocol):
             self._set_timer(STALLED_S)
 
     def resume_writing(self) -> None:
-        """Go on with answers and events, because the client reads again."""
+        """Go on with answers and events, because the program reads again."""
         self._blocked = False
         self._stop_timer()
         if self._reader is not None:
@@ -288,33 +288,33 @@ class Connection(asyncio.Protocol):
         self._ended = True
         self._stop_timer()
         self._requests.clear()
-        if self in self._console.connections:
-            self._console.connections.remove(self)
-            self._console.counted(self.client, -1)
+        if self in self._console.sockets:
+            self._console.sockets.remove(self)
+            self._console.counted(self.program, -1)
         if self._reader is not None:
             self._console.feed.remove(self._reader)
         self._release_unheard()
         if self._has_registrars:
-            self._clean_up(self._console.view.clients.close, self)
+            self._clean_up(self._console.view.connected.close, self)
 
     def _release_unheard(self) -> None:
         unheard, self._unheard = self._unheard, ()
         if unheard:
-            self._clean_up(self._console.view.clients.release_unheard, *unheard)
+            self._clean_up(self._console.view.connected.release_unheard, *unheard)
 
     def _clean_up(self, fn: Callable[..., None], *args: Any) -> None:
-        """Have a worker release what the client has left, after an opening that may still be in progress."""
+        """Have a worker release what the program has left, after an opening that may still be in progress."""
         try:
             self._console.node.dispatcher.workers.serial(self, fn, *args)
         except MailboxFull:
             asyncio.get_running_loop().call_later(_AGAIN_S, self._clean_up, fn, *args)
         except Unavailable:  # the process is closing, and with it all its registrars
-            logger.debug("the registrars of a client are closed with the system")
+            logger.debug("the registrars of a program are closed with the system")
 
     # -- requests ----------------------------------------------------------------------------------------------------
 
     def _next(self) -> None:
-        """Begin with the next request, if the last one is answered and the client has read the answer."""
+        """Begin with the next request, if the last one is answered and the program has read the answer."""
         if self._ended or self._busy or self._blocked:
             return
         while self._greeted and self._requests and isinstance(self._requests[0], c.Keep):
@@ -344,17 +344,19 @@ class Connection(asyncio.Protocol):
                 Unavailable(f"console: expected Hello of version {c.VERSION}, got {said}: use the same rr_actors")
             )
             return
-        clients, limit = self._console.clients, self._console.clients_limit
-        client = request.client or self
-        if client not in clients and len(clients) - ("" in clients) >= limit:
-            self._leave(Unavailable(f"{limit} clients are connected already: close one, or raise clients_limit"))
+        programs, limit = self._console.programs, self._console.connections_limit
+        program = request.program or self
+        if program not in programs and len(programs) - ("" in programs) >= limit:
+            self._leave(
+                Unavailable(f"{limit} programs are connected already: close a connection, or raise connections_limit")
+            )
             return
-        if clients[client] >= CONNECTIONS_LIMIT:
-            self._leave(Unavailable(f"this client has {CONNECTIONS_LIMIT} connections already, one for each call"))
+        if programs[program] >= SOCKETS_LIMIT:
+            self._leave(Unavailable(f"this connection has {SOCKETS_LIMIT} sockets already, one for each call"))
             return
         self._console.counted("", -1)
-        self._console.counted(client, 1)
-        self.client = client
+        self._console.counted(program, 1)
+        self.program = program
         self._greeted = True
         self._transport.write(framed(self._console.welcome, c.ANSWER_LIMIT_BYTES))
         self._next()
@@ -362,7 +364,7 @@ class Connection(asyncio.Protocol):
     def _begin(self, request: c.Message) -> None:
         self._busy = True
         self._release_unheard()
-        if isinstance(request, AwaitStatuses) and not self._console.view.clients.has_statuses(
+        if isinstance(request, AwaitStatuses) and not self._console.view.connected.has_statuses(
             request.registrar, self, functools.partial(self._begin_again, request)
         ):
             return
@@ -423,14 +425,14 @@ class Connection(asyncio.Protocol):
     # -- the end -----------------------------------------------------------------------------------------------------
 
     def end(self) -> None:
-        """Send what is written, and close the connection; at once, if the client does not read."""
+        """Send what is written, and close the connection; at once, if the program does not read."""
         self._ended = True
         if self._reader is not None:
             self._console.feed.remove(self._reader)
         if self._blocked:
             self._transport.abort()
         else:
-            self._set_timer(STALLED_S)  # the client may never read the rest
+            self._set_timer(STALLED_S)  # the program may never read the rest
             self._transport.close()
 
     def _leave(self, error: BaseException) -> None:

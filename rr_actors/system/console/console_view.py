@@ -36,7 +36,7 @@ from rr_actors.streams.stream import StreamRow
 from rr_actors.supervision.supervisor import SupervisorRef
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.attention.attention_items import Silences
-from rr_actors.system.console.client_registrars import Caller, ClientRegistrars
+from rr_actors.system.console.connected_registrars import Caller, ConnectedRegistrars
 from rr_actors.system.recording.event_memory import Event, EventMemory, events_below, events_of
 from rr_actors.system.recording.figures import Figure
 from rr_actors.system.registrar_lookup import open_registrar, registrar_in
@@ -96,7 +96,7 @@ class View:
         shut_down: stops the system, in a thread of its own.
 
     Attributes:
-        clients: the registrars of clients.
+        connected: the registrars of connected programs.
         silences: what is not to be shown of what needs attention.
     """
 
@@ -108,7 +108,7 @@ class View:
         self.memory = memory
         self.child_logs = child_logs
         self.shut_down = shut_down
-        self.clients = ClientRegistrars()
+        self.connected = ConnectedRegistrars()
         self.silences = Silences()
         self._opening = threading.Lock()
         self._titles: dict[str, str] = {}  # of the requests of queries, by the ids of these

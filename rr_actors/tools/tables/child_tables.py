@@ -9,7 +9,7 @@ from rr_actors.base.errors import counted
 from rr_actors.registrar.pages import ServerRow
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
-from rr_actors.system.console.console_client import read_pages
+from rr_actors.system.console.console_connection import read_pages
 from rr_actors.system.recording.event_texts import ago
 from rr_actors.tools.process_usage import BUCKETS, RateWatch, Usage, UsageWatch, facts_of
 from rr_actors.tools.tables.table import Asks, Column, Look, Row, Rows, Table

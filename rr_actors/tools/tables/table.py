@@ -24,7 +24,7 @@ STATE_STYLES = {"WARNING": "yellow", "ERROR": "red", "FATAL": "red", "revoked": 
 
 
 class Asks(Protocol):
-    """An object that answers questions to the system: a ConsoleLink or a ConsoleClient."""
+    """An object that answers questions to the system: a ConsoleLink or a ConsoleConnection."""
 
     def ask(self, request: Verb[_A], timeout_s: float | None = None) -> _A:
         """Send a question or a command, and return its answer."""

@@ -16,9 +16,9 @@ from rr_actors.managers.actions.graph_model import ActionGraph
 from rr_actors.managers.actions.graph_pictures import draw_graph
 from rr_actors.managers.actions.graph_results import run_graph
 from rr_actors.supervision.core.rendering import mermaid_text
-from rr_actors.system.console.connected_client import connect
-from rr_actors.system.console.console_client import ConsoleClient, find_console
+from rr_actors.system.console.connection import connect
 from rr_actors.system.console.console_commands import AskActor
+from rr_actors.system.console.console_connection import ConsoleConnection, find_console
 from rr_actors.system.console.console_questions import Find
 from rr_actors.tools.cli_commands import say, say_json, say_picture, say_table
 
@@ -76,8 +76,8 @@ def run(file: Path, state: Path | None, inputs: str, timeout_s: float) -> None:
         given = msgspec.json.decode(inputs.encode(), type=dict[str, object])
     except (msgspec.MsgspecError, UnicodeEncodeError) as error:
         raise UsageError(f"--inputs: expected a JSON object, got {shown(inputs)}: {error}") from error
-    with connect(state) as client:
-        ended = run_graph(client.open_registrar(_HOLDER), _named(file) or file, inputs=given, timeout_s=timeout_s)
+    with connect(state) as connection:
+        ended = run_graph(connection.open_registrar(_HOLDER), _named(file) or file, inputs=given, timeout_s=timeout_s)
     say_table(("action", "state"), list(ended.states.items()), gives_way=("action",))
     say_json({"result": ended.result, "outputs": ended.outputs, "error": ended.error})
     if ended.result != "on_true":
@@ -103,8 +103,8 @@ def change(file: Path, id: str, state: Path | None, start: str) -> None:
     """
     name = _named(file)
     graph = None if name else read_graph_file(file)
-    with ConsoleClient(find_console(state), timeout_s=_ANSWER_S + 10) as client:
-        found = [row for row in client.ask(Find(id)).resources if row.server.endswith("/graph")]
+    with ConsoleConnection(find_console(state), timeout_s=_ANSWER_S + 10) as connection:
+        found = [row for row in connection.ask(Find(id)).resources if row.server.endswith("/graph")]
         if len(found) > 1:
             raise UsageError(f"{shown(id)}: {len(found)} graphs have this in their ids; give more of the id")
         if not found:
@@ -112,5 +112,5 @@ def change(file: Path, id: str, state: Path | None, start: str) -> None:
         new = name if graph is None else graph.document
         message = {"change_graph": found[0].id, "new": new, "start": start, "file": "" if name else str(file)}
         manager = found[0].server.partition("/")[0]
-        client.ask(AskActor(manager, encode(message, f"message to {manager}"), _ANSWER_S))
+        connection.ask(AskActor(manager, encode(message, f"message to {manager}"), _ANSWER_S))
     say(f"{found[0].id}: goes on as {name if graph is None else graph.name}")

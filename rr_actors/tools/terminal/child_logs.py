@@ -10,7 +10,7 @@ from rr_actors.base.errors import NotFound
 from rr_actors.base.values.canonical import Codec
 from rr_actors.hosting.forwarded_logs import LogLine
 from rr_actors.system.console.asking.actor_calls import CallActor, given_bytes
-from rr_actors.system.console.console_client import ConsoleClient
+from rr_actors.system.console.console_connection import ConsoleConnection
 from rr_actors.system.console.console_messages import PAGE_LIMIT, ChildLog
 from rr_actors.system.console.console_questions import Find, ListChildren, ListHistory, ListLog
 from rr_actors.system.recording.event_memory import Event
@@ -62,44 +62,44 @@ def _clock(at: float) -> str:
     return f"{time.strftime('%H:%M:%S', time.localtime(at))}.{int(at % 1 * 1000):03d}"
 
 
-def log_of(client: ConsoleClient, child: str, count: int, *, previous: bool = False) -> ChildLog:
+def log_of(connection: ConsoleConnection, child: str, count: int, *, previous: bool = False) -> ChildLog:
     """Return the last `count` lines of a child; with `previous` those of the process before the one that runs."""
-    log = client.ask(ListLog(child))
+    log = connection.ask(ListLog(child))
     lines = log.lines
     if previous:
-        rows = client.ask(ListChildren(log.path)).rows
+        rows = connection.ask(ListChildren(log.path)).rows
         runs = {row.pid for row in rows if row.path == log.path}
         before = [line.pid for line in lines if line.pid not in runs]
         lines = [line for line in lines if line.pid == before[-1]] if before else []
     return ChildLog(log.path, log.total, lines[-count:], log.note)
 
 
-def events_of_child(client: ConsoleClient, path: str) -> list[Event]:
+def events_of_child(connection: ConsoleConnection, path: str) -> list[Event]:
     """Return the newest events of a child's history."""
-    return client.ask(ListHistory(path, PAGE_LIMIT)).events
+    return connection.ask(ListHistory(path, PAGE_LIMIT)).events
 
 
-def new_lines(client: ConsoleClient, path: str, after: int) -> Iterator[list[LogLine]]:
+def new_lines(connection: ConsoleConnection, path: str, after: int) -> Iterator[list[LogLine]]:
     """Yield the lines of a child with higher numbers than `after` as they come, without end.
 
     Raises:
         NotRunning: the system has ended.
     """
     while True:
-        lines = client.ask(ListLog(path, after)).lines
+        lines = connection.ask(ListLog(path, after)).lines
         if lines:
             after = lines[-1].seq
             yield lines
         time.sleep(_TICK_S)
 
 
-def output_of(client: ConsoleClient, program: str, count: int) -> list[str] | None:
+def output_of(connection: ConsoleConnection, program: str, count: int) -> list[str] | None:
     """Return the last lines of an external program's output; None if this is the name or id of no program."""
-    found = [row for row in client.ask(Find(program)).resources if row.server.endswith("/program")]
+    found = [row for row in connection.ask(Find(program)).resources if row.server.endswith("/program")]
     if len(found) != 1:
         return None
     registrar, id = found[0].server.partition("/")[0], found[0].id
     given = given_bytes(registrar, "output", (id, count))
     with suppress(NotFound):  # another manager than Programs
-        return _answer.show(client.ask(CallActor(registrar, "output", given)).answer)
+        return _answer.show(connection.ask(CallActor(registrar, "output", given)).answer)
     return None

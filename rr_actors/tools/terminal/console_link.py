@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from rr_actors.base.errors import RrError
-from rr_actors.system.console.console_client import Connections, NotRunning, find_console
+from rr_actors.system.console.console_connection import Connections, NotRunning, find_console
 from rr_actors.system.console.console_messages import Events, Follow, Missed, Welcome
 from rr_actors.system.console.console_view import Verb
 
@@ -31,8 +31,8 @@ class ConsoleLink:
     def __init__(self, state_dir: str | os.PathLike[str] | None = None) -> None:
         self.state_dir = state_dir
         self._connections = Connections(lambda: find_console(self.state_dir), _LONGEST_S)
-        with self._connections.lent() as client:
-            self.state_dir = client.welcome.state_dir
+        with self._connections.lent() as connection:
+            self.state_dir = connection.welcome.state_dir
 
     def ask(self, request: Verb[_A], timeout_s: float | None = None) -> _A:
         """Send a question or a command, and return its answer.
@@ -51,9 +51,9 @@ class ConsoleLink:
         """
         ended = f"the system in {self.state_dir} has stopped"
         try:
-            with self._connections.open() as client:
-                found(client.welcome)
-                for part in client.follow(Follow()):
+            with self._connections.open() as connection:
+                found(connection.welcome)
+                for part in connection.follow(Follow()):
                     hear(part)
         except NotRunning:
             ended = f"no system runs in {self.state_dir}"

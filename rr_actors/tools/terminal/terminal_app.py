@@ -28,7 +28,7 @@ from rr_actors.base.names import short_id
 from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.attention.attention_questions import ListAttention
-from rr_actors.system.console.console_client import NotRunning
+from rr_actors.system.console.console_connection import NotRunning
 from rr_actors.system.console.console_questions import ListEvents
 from rr_actors.system.console.console_view import Command
 from rr_actors.tools.tables.row_commands import (

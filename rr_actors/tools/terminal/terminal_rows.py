@@ -17,7 +17,7 @@ from rr_actors.registrar.pages import HolderRow, QueryRow, ResourceRow
 from rr_actors.streams.stream import StreamRow
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
-from rr_actors.system.console.console_client import read_pages
+from rr_actors.system.console.console_connection import read_pages
 from rr_actors.system.console.console_view import Verb
 from rr_actors.system.recording.event_memory import Event
 from rr_actors.system.recording.event_texts import ago

@@ -9,8 +9,8 @@ import typer
 
 from rr_actors.base.errors import NotRunning, UsageError, counted, shown
 from rr_actors.system.backups import WRITING_S, back_up_files
-from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_commands import BackUp
+from rr_actors.system.console.console_connection import ConsoleConnection, find_console
 from rr_actors.system.system import System
 from rr_actors.tools.cli_commands import JsonOption, StateOption, say, say_json
 from rr_actors.tools.verbs.console_options import DryRun, Timeout
@@ -39,8 +39,8 @@ def backup(
         made = back_up_files(state, path)
         done, facts = made.told(str(path)), made.facts(str(path))
     else:
-        with ConsoleClient(console, timeout_s=timeout_s + WRITING_S) as client:
-            answer = client.ask(BackUp(str(path), timeout_s, dry_run))
+        with ConsoleConnection(console, timeout_s=timeout_s + WRITING_S) as connection:
+            answer = connection.ask(BackUp(str(path), timeout_s, dry_run))
         done, facts = answer.text, answer.facts
     if as_json:
         say_json({"done": done, **facts})

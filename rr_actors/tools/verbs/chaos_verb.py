@@ -10,7 +10,7 @@ import msgspec
 import typer
 
 from rr_actors.base.errors import counted
-from rr_actors.system.console.console_client import ConsoleClient, find_console
+from rr_actors.system.console.console_connection import ConsoleConnection, find_console
 from rr_actors.tools.cli_commands import JsonOption, StateOption, say, say_json, say_lines, say_table
 from rr_actors.tools.random_kills import KillPlan, KillReport, RandomKills
 from rr_actors.tools.verbs.console_options import DryRun, Timeout, complete_child
@@ -54,12 +54,12 @@ def chaos(
     """
     chosen = random.SystemRandom().randrange(_SEEDS) if seed is None else seed
     plan = KillPlan(kills, chosen, seconds, tuple(only or ()), regardless, timeout_s)
-    with ConsoleClient(find_console(state)) as client:
-        run = RandomKills(client, plan, lambda line: say(line, err=True))
+    with ConsoleConnection(find_console(state)) as connection:
+        run = RandomKills(connection, plan, lambda line: say(line, err=True))
         if dry_run:
             _say_plan(run, plan, as_json)
             return
-        say(f"seed {plan.seed}, the system in {client.welcome.state_dir}", err=True)
+        say(f"seed {plan.seed}, the system in {connection.welcome.state_dir}", err=True)
         report = run.run()
     if as_json:
         say_json(msgspec.to_builtins(report) | {"passed": not report.violations and not report.interrupted})

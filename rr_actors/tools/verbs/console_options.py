@@ -10,7 +10,7 @@ import typer
 
 from rr_actors.base.errors import RrError
 from rr_actors.system.console import console_messages as c
-from rr_actors.system.console.console_client import ConsoleClient, find_console
+from rr_actors.system.console.console_connection import ConsoleConnection, find_console
 from rr_actors.system.console.console_view import Command
 from rr_actors.tools.cli_commands import say, say_json
 
@@ -20,13 +20,13 @@ _GRACE_S = 10.0  # for an answer, added to the time limit of the command
 _COMPLETED = 50
 
 
-def completing(list_them: Callable[[ConsoleClient, str], list[str]]) -> Callable[[typer.Context, str], list[str]]:
+def completing(list_them: Callable[[ConsoleConnection, str], list[str]]) -> Callable[[typer.Context, str], list[str]]:
     """Return a function that lists a shell's completions of an argument; none if no running system can be asked."""
 
     def complete(context: typer.Context, incomplete: str) -> list[str]:
         try:
-            with client_of(context.params.get("state")) as client:
-                found = list_them(client, incomplete)
+            with connection_of(context.params.get("state")) as connection:
+                found = list_them(connection, incomplete)
         except (RrError, OSError):
             return []
         return [text for text in found if text.startswith(incomplete)][:_COMPLETED]
@@ -34,45 +34,45 @@ def completing(list_them: Callable[[ConsoleClient, str], list[str]]) -> Callable
     return complete
 
 
-def list_children(client: ConsoleClient, incomplete: str) -> list[str]:
+def list_children(connection: ConsoleConnection, incomplete: str) -> list[str]:
     """Return the children: their paths if a path is being typed, else their ids."""
-    rows = [row for row in client.children().rows if row.depth]
+    rows = [row for row in connection.children().rows if row.depth]
     return [row.path if "/" in incomplete else row.id for row in rows]
 
 
-def list_servers(client: ConsoleClient, _incomplete: str) -> list[str]:
+def list_servers(connection: ConsoleConnection, _incomplete: str) -> list[str]:
     """Return all servers."""
-    return [server for row in client.registrars().rows for server in row.servers]
+    return [server for row in connection.registrars().rows for server in row.servers]
 
 
-def list_registrars(client: ConsoleClient, _incomplete: str) -> list[str]:
+def list_registrars(connection: ConsoleConnection, _incomplete: str) -> list[str]:
     """Return all registrars."""
-    return [row.name for row in client.registrars().rows]
+    return [row.name for row in connection.registrars().rows]
 
 
-def list_resources(client: ConsoleClient, incomplete: str) -> list[str]:
+def list_resources(connection: ConsoleConnection, incomplete: str) -> list[str]:
     """Return the ids of the resources with this text in them."""
-    return [row.id for row in client.resources(match=incomplete, limit=_COMPLETED).rows]
+    return [row.id for row in connection.resources(match=incomplete, limit=_COMPLETED).rows]
 
 
-def list_children_or_resources(client: ConsoleClient, incomplete: str) -> list[str]:
+def list_children_or_resources(connection: ConsoleConnection, incomplete: str) -> list[str]:
     """Return children, then resources."""
-    return list_children(client, incomplete) + list_resources(client, incomplete)
+    return list_children(connection, incomplete) + list_resources(connection, incomplete)
 
 
-def list_queries(client: ConsoleClient, incomplete: str) -> list[str]:
+def list_queries(connection: ConsoleConnection, incomplete: str) -> list[str]:
     """Return the ids of the queries with this text in them."""
-    return [row.id for row in client.queries(match=incomplete, limit=_COMPLETED).rows]
+    return [row.id for row in connection.queries(match=incomplete, limit=_COMPLETED).rows]
 
 
-def list_targets(client: ConsoleClient, incomplete: str) -> list[str]:
+def list_targets(connection: ConsoleConnection, incomplete: str) -> list[str]:
     """Return the ids of resources, then of queries."""
-    return list(dict.fromkeys(list_resources(client, incomplete) + list_queries(client, incomplete)))
+    return list(dict.fromkeys(list_resources(connection, incomplete) + list_queries(connection, incomplete)))
 
 
-def list_children_or_targets(client: ConsoleClient, incomplete: str) -> list[str]:
+def list_children_or_targets(connection: ConsoleConnection, incomplete: str) -> list[str]:
     """Return children, then the ids of resources and queries."""
-    return list_children(client, incomplete) + list_targets(client, incomplete)
+    return list_children(connection, incomplete) + list_targets(connection, incomplete)
 
 
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Change nothing; say what would be done.")]
@@ -99,15 +99,15 @@ Output = Annotated[
 ]
 
 
-def client_of(state: Path | str | None, timeout_s: float = 60.0) -> ConsoleClient:
+def connection_of(state: Path | str | None, timeout_s: float = 60.0) -> ConsoleConnection:
     """Return a connection to the running system of a state directory; None: to the only one."""
-    return ConsoleClient(find_console(state), timeout_s=timeout_s + _GRACE_S)
+    return ConsoleConnection(find_console(state), timeout_s=timeout_s + _GRACE_S)
 
 
 def carry_out(state: Path | None, command: Command[c.Done], as_json: bool = False, timeout_s: float = 60.0) -> c.Done:
     """Send a command to the running system, and print what it has done."""
-    with client_of(state, timeout_s) as client:
-        done = client.ask(command)
+    with connection_of(state, timeout_s) as connection:
+        done = connection.ask(command)
     if as_json:
         say_json({"done": done.text, **done.facts})
     else:

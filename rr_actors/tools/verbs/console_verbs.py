@@ -19,7 +19,7 @@ from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
 from rr_actors.system.console.asking.actor_calls import CallActor, given_bytes
-from rr_actors.system.console.console_client import ConsoleClient
+from rr_actors.system.console.console_connection import ConsoleConnection
 from rr_actors.system.recording.event_memory import Event, events_of, is_of_child, left_events
 from rr_actors.tools.cli_commands import JsonOption, StateOption, say, say_json, say_lines
 from rr_actors.tools.explanations import explain, explain_actor, past_of_child
@@ -31,8 +31,8 @@ from rr_actors.tools.verbs.console_options import (
     ParentOption,
     Timeout,
     carry_out,
-    client_of,
     completing,
+    connection_of,
     list_children,
     list_children_or_targets,
     list_registrars,
@@ -88,9 +88,9 @@ def events(
         for line in known.lines(wanted)[-(count or 20) :]:
             say(str(line))
         return
-    with client_of(state) as client:
+    with connection_of(state) as connection:
         left = sys.maxsize if count is None else count
-        for lines in _following(client, wanted, as_json):
+        for lines in _following(connection, wanted, as_json):
             for line in lines[:left]:
                 say_json(line) if as_json else say(str(line))
             left -= len(lines)
@@ -99,10 +99,10 @@ def events(
     say("the system has ended", err=True)
 
 
-def _following(client: ConsoleClient, wanted: EventFilter, as_json: bool) -> Iterator[list[Any]]:
+def _following(connection: ConsoleConnection, wanted: EventFilter, as_json: bool) -> Iterator[list[Any]]:
     """Yield what happens from now on: facts, or lines to which nothing more will be added."""
     known = EventLines()
-    for part in client.follow(c.Follow(sorted(wanted.kinds)), _TICK_S):
+    for part in connection.follow(c.Follow(sorted(wanted.kinds)), _TICK_S):
         if isinstance(part, c.Missed):
             _say_missed(part, as_json)
         elif as_json:
@@ -122,8 +122,8 @@ def _say_facts(events: list[Event]) -> None:
 def _remembered(state: Path | None, question: questions.ListEvents | questions.ListHistory) -> list[Event]:
     """Return the events of a running system, or those that it has left in its state directory."""
     try:
-        with client_of(state) as client:
-            found = client.ask(question)
+        with connection_of(state) as connection:
+            found = connection.ask(question)
     except NotRunning:
         of_children = isinstance(question, questions.ListHistory)
         events = left_events(state, _LEFT, is_of_child if of_children else None) if state is not None else []
@@ -168,8 +168,8 @@ def stack(
     child: ChildArgument, timeout_s: Timeout = 5.0, state: StateOption = None, as_json: JsonOption = False
 ) -> None:
     """Show where each thread of a child's process is now, also if the child is stuck."""
-    with client_of(state, timeout_s) as client:
-        found = client.ask(questions.ListStacks(child, timeout_s))
+    with connection_of(state, timeout_s) as connection:
+        found = connection.ask(questions.ListStacks(child, timeout_s))
     if as_json:
         say_json({"path": found.path, **msgspec.to_builtins(found.stacks)})
         return
@@ -230,9 +230,9 @@ def why(
     An actor that asks waits for the one that it has asked. If these wait for each other, the ring is named. The events
     that the system remembers say since when a resource or child has its state, and what came before.
     """
-    with client_of(state) as client:
-        lines = explain_actor(lambda one: client.ask(questions.LookAtMailbox(one)).mailbox, id)
-        for line in [*lines, *past_of_child(client, id)] if lines else explain(client, id):
+    with connection_of(state) as connection:
+        lines = explain_actor(lambda one: connection.ask(questions.LookAtMailbox(one)).mailbox, id)
+        for line in [*lines, *past_of_child(connection, id)] if lines else explain(connection, id):
             say(line)
 
 
@@ -301,8 +301,8 @@ def call(
 ) -> None:
     """Call a method of an actor with plain data, and show its answer; without METHOD, show which methods there are."""
     if not method:
-        with client_of(state, timeout_s) as client:
-            rows = client.ask(questions.ListMethods(actor)).rows
+        with connection_of(state, timeout_s) as connection:
+            rows = connection.ask(questions.ListMethods(actor)).rows
         if as_json:
             say_json(rows)
         elif not rows:
@@ -312,8 +312,8 @@ def call(
             say_lines("\n".join(f"    {line}".rstrip() for line in row.help.splitlines()))
         return
     data = given_bytes(actor, method, [_argument(text) for text in given or ()])
-    with client_of(state, timeout_s + _ANSWER_S) as client:
-        answer = client.ask(CallActor(actor, method, data, timeout_s)).answer
+    with connection_of(state, timeout_s + _ANSWER_S) as connection:
+        answer = connection.ask(CallActor(actor, method, data, timeout_s)).answer
     say_json(Codec(None, "answer").show(answer))
 
 
@@ -448,8 +448,8 @@ def shutdown(
     if not wait or dry_run:
         carry_out(state, commands.ShutDown(dry_run), as_json)
         return
-    with client_of(state) as client:
-        happens = client.follow(c.Follow())
+    with connection_of(state) as connection:
+        happens = connection.follow(c.Follow())
         carry_out(state, commands.ShutDown(), as_json)
         for _ in happens:  # until the system's console ends, after its children
             pass

@@ -45,8 +45,8 @@ from rr_actors.tools.verbs.console_options import (
     Output,
     RowLimit,
     carry_out,
-    client_of,
     completing,
+    connection_of,
     list_registrars,
 )
 from rr_actors.wire.name_service import HostInfo
@@ -132,8 +132,8 @@ def _verb(sheet: Sheet) -> Callable[..., None]:
 
 def _show(tables: Sequence[Table[Any]], look: Look, limit: int | None, form: str, state: Path | None) -> None:
     most = _most(limit, form)
-    with client_of(state) as client:
-        parts = [table.read(client, look, most) for table in tables]
+    with connection_of(state) as connection:
+        parts = [table.read(connection, look, most) for table in tables]
     if form == "json":
         read = zip(tables, parts, strict=True)
         facts = {table.name: [_nested(table.facts(row)) for row in part.rows] for table, part in read}
@@ -210,8 +210,8 @@ def usage(
 
 def _show_usages(state: Path | None, match: str, registrar: str, sort_by: str, limit: int | None, form: str) -> None:
     """Show usages. Their columns are the numbers that the servers say."""
-    with client_of(state) as client:
-        page = client.usages(registrar, match)
+    with connection_of(state) as connection:
+        page = connection.usages(registrar, match)
     rows = [row for row in page.rows if row.usage or row.failure]
     names = list(dict.fromkeys(name for row in rows for name in row.usage))
     if sort_by:
@@ -270,8 +270,8 @@ def attention(
     found = list[AttentionItem]()
 
     def show() -> None:
-        with client_of(state) as client:
-            answer = client.ask(ListAttention())
+        with connection_of(state) as connection:
+            answer = connection.ask(ListAttention())
         found[:] = answer.items
         _say_attention(answer, as_json)
 
@@ -302,8 +302,8 @@ def _say_attention(answer: Attention, as_json: bool) -> None:
 @app.command("dead-letters", epilog="Example: rr-actors dead-letters --limit 5")
 def dead_letters(limit: Limit = 20, state: StateOption = None, as_json: JsonOption = False) -> None:
     """Show how many messages could not be delivered, and the newest of them."""
-    with client_of(state) as client:
-        letters = client.ask(ListDeadLetters(min(limit, PAGE_LIMIT)))
+    with connection_of(state) as connection:
+        letters = connection.ask(ListDeadLetters(min(limit, PAGE_LIMIT)))
     if as_json:
         say_json({"count": letters.count, "letters": letters.letters})
     else:
@@ -313,8 +313,8 @@ def dead_letters(limit: Limit = 20, state: StateOption = None, as_json: JsonOpti
 @app.command("hosts", epilog="Example: rr-actors hosts")
 def hosts(state: StateOption = None, as_json: JsonOption = False) -> None:
     """Show the other hosts that the system knows: whether each is reachable, since when, and what it exports."""
-    with client_of(state) as client:
-        found = client.ask(ListHosts())
+    with connection_of(state) as connection:
+        found = connection.ask(ListHosts())
     if as_json:
         say_json({"host": found.host, "hosts": found.rows})
     elif not found.rows:

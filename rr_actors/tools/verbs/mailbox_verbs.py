@@ -32,9 +32,9 @@ from rr_actors.tools.verbs.console_options import (
     DryRun,
     Timeout,
     carry_out,
-    client_of,
     complete_child,
     completing,
+    connection_of,
     list_children,
     list_children_or_resources,
 )
@@ -65,8 +65,8 @@ def mailbox(
 
 
 def _show(state: Path | None, actor: str, as_json: bool) -> None:
-    with client_of(state, _ANSWER_S) as client:
-        found = client.ask(LookAtMailbox(actor)).mailbox
+    with connection_of(state, _ANSWER_S) as connection:
+        found = connection.ask(LookAtMailbox(actor)).mailbox
     if as_json:
         say_json({name: getattr(found, name) for name in found.__struct_fields__})
     else:
@@ -127,7 +127,7 @@ def wait(
     check_state(wanted, "--for")
     began = time.monotonic()
     until = began + (0 if wanted.lower() == GONE else timeout_s)
-    done, seen = wait_for(lambda: patiently(lambda: client_of(state), until), target, wanted, timeout_s)
+    done, seen = wait_for(lambda: patiently(lambda: connection_of(state), until), target, wanted, timeout_s)
     waited_s = round(time.monotonic() - began, 1)
     if as_json:
         say_json({"target": target, "state": seen, "waited_s": waited_s, "done": done})
@@ -167,17 +167,17 @@ def status(
 
 def _show_status(state: Path | None, target: str, as_json: bool) -> None:
     """Show a child with its latest history, or explain a resource; exit code 1 if a child does not run."""
-    with client_of(state) as client:
-        if (row := child_of(client, target)) is None:
+    with connection_of(state) as connection:
+        if (row := child_of(connection, target)) is None:
             try:
-                lines = explain(client, target.rpartition("/")[2] if " " not in target else target)
+                lines = explain(connection, target.rpartition("/")[2] if " " not in target else target)
             except UnknownQuery as error:
-                hint = did_you_mean(target, list_children(client, target))
+                hint = did_you_mean(target, list_children(connection, target))
                 raise UnknownQuery(f"{error}{hint}", query_id=target) from error
             say_json({"text": lines}) if as_json else say_lines("\n".join(lines))
             return
-        served = [one for one in client.registrars().rows if one.name == row.id]
-        happened = client.ask(ListHistory(row.path, _LATEST)).events
+        served = [one for one in connection.registrars().rows if one.name == row.id]
+        happened = connection.ask(ListHistory(row.path, _LATEST)).events
     facts = facts_of(row)
     if as_json:
         say_json(facts | {"registrars": served, "history": [event.flat() for event in happened]})

@@ -15,8 +15,8 @@ from rr_actors.base.errors import UsageError
 from rr_actors.base.names import short_id
 from rr_actors.base.toml import read_bytes
 from rr_actors.base.values.canonical import Codec, encode
-from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_commands import AskActor
+from rr_actors.system.console.console_connection import ConsoleConnection, find_console
 from rr_actors.tools.cli_commands import JsonOption, StateOption, say, say_json, say_lines
 from rr_actors.tools.tables.plan_table import PLANS, columns_of, source
 from rr_actors.tools.tables.table import Look
@@ -35,15 +35,15 @@ KeeperOption = Annotated[str, typer.Option("--keeper", metavar="ID", help="The i
 
 def _asked(state: Path | None, planner: str, message: dict[str, Any]) -> Any:
     command = AskActor(planner, encode(message, f"message to {planner}"), _ANSWER_S)
-    with ConsoleClient(find_console(state), timeout_s=_ANSWER_S + 10) as client:
-        return _LOOSE.show(client.ask(command).answer)
+    with ConsoleConnection(find_console(state), timeout_s=_ANSWER_S + 10) as connection:
+        return _LOOSE.show(connection.ask(command).answer)
 
 
 def _say_table(state: Path | None, planner: str, name: str, none: str, as_json: bool) -> None:
     """Print the table of this name that a child declares."""
     table = replace(PLANS, source=source(name, planner, _ANSWER_S))
-    with ConsoleClient(find_console(state), timeout_s=_ANSWER_S + 10) as client:
-        rows = table.read(client, Look(), sys.maxsize).rows
+    with ConsoleConnection(find_console(state), timeout_s=_ANSWER_S + 10) as connection:
+        rows = table.read(connection, Look(), sys.maxsize).rows
     if as_json:
         say_json([row.facts for row in rows])
     elif rows:

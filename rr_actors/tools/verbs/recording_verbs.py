@@ -25,7 +25,7 @@ from rr_actors.registrar.model.recorded import Entry
 from rr_actors.streams.stream import Stream, StreamFrame, StreamRow
 from rr_actors.streams.stream_file import StreamHeader, StreamWriter
 from rr_actors.system.console import console_messages as c
-from rr_actors.system.console.console_client import ConsoleClient, find_console, read_pages
+from rr_actors.system.console.console_connection import ConsoleConnection, find_console, read_pages
 from rr_actors.system.console.console_questions import Find, ListChildren, ListResources, ReadResponse
 from rr_actors.system.recording.recordings import Recording, RecordingFile, add, present_entries, read_recording
 from rr_actors.system.recording.stream_recordings import LIMIT_BYTES
@@ -46,7 +46,7 @@ from rr_actors.tools.explanations import age_text, bytes_text, rate_text, reader
 from rr_actors.tools.tables.stream_table import stream_facts
 from rr_actors.tools.terminal.child_logs import LogText, events_of_child, log_of, new_lines, output_of
 from rr_actors.tools.terminal.stream_frames import frames_of, png
-from rr_actors.tools.verbs.console_options import SHOWN, ChildArgument, Limit, Timeout, client_of
+from rr_actors.tools.verbs.console_options import SHOWN, ChildArgument, Limit, Timeout, connection_of
 from rr_actors.tools.web.timeline_file import html
 
 app = typer.Typer()
@@ -70,11 +70,11 @@ def record(
 ) -> None:
     """Record the events, exits, callbacks and messages of the system: of its actors and registrars."""
     count = missed = 0
-    with ConsoleClient(find_console(state)) as client:
-        sink = RecordingFile(file, client.welcome.system, time.time())
+    with ConsoleConnection(find_console(state)) as connection:
+        sink = RecordingFile(file, connection.welcome.system, time.time())
         try:
-            with _ending(client, seconds), suppress(KeyboardInterrupt):
-                parts = client.record()
+            with _ending(connection, seconds), suppress(KeyboardInterrupt):
+                parts = connection.record()
                 sink.write(_present(state))
                 for part in parts:
                     missed += part.dropped
@@ -93,8 +93,8 @@ def _present(state: Path | None) -> list[Entry]:
     """
     children, pages, notes = list[c.ChildRow](), list[c.Resources](), list[str]()
     try:
-        with ConsoleClient(find_console(state)) as client:
-            ask = partial(client.ask, timeout_s=_BEGIN_S)
+        with ConsoleConnection(find_console(state)) as connection:
+            ask = partial(connection.ask, timeout_s=_BEGIN_S)
             children += [row for page in read_pages(ask, ListChildren()) for row in page.rows]
             pages += read_pages(ask, ListResources(), _PRESENT)
     except RrError as error:
@@ -191,10 +191,10 @@ def _recorded(what: list[str], state: Path | None, seconds: float) -> tuple[Reco
     if what and (what[0].endswith(_SUFFIX) or Path(what[0]).is_file()):
         recording, what = read_recording(what[0]), what[1:]
     else:
-        with ConsoleClient(find_console(state)) as client:
-            recording = Recording(client.welcome.system)
-            with _ending(client, seconds), suppress(KeyboardInterrupt):
-                for part in client.record():
+        with ConsoleConnection(find_console(state)) as connection:
+            recording = Recording(connection.welcome.system)
+            with _ending(connection, seconds), suppress(KeyboardInterrupt):
+                for part in connection.record():
                     add(recording, part.entries, part.dropped)
     if recording.missed:
         say(f"the recording lacks {counted(recording.missed, 'entry')}: its reader was too slow", err=True)
@@ -202,9 +202,9 @@ def _recorded(what: list[str], state: Path | None, seconds: float) -> tuple[Reco
 
 
 @contextmanager
-def _ending(client: ConsoleClient, seconds: float | None) -> Generator[None]:
-    """Close the client's connection after so many seconds, which ends the client's iterators."""
-    close: Callable[[], None] = client.close
+def _ending(connection: ConsoleConnection, seconds: float | None) -> Generator[None]:
+    """Close the connection after so many seconds, which ends its iterators."""
+    close: Callable[[], None] = connection.close
     timer = threading.Timer(seconds or 0.0, close)
     if seconds is not None:
         timer.start()
@@ -261,9 +261,9 @@ def graph(
         else:
             action_graphs.run(file, state, inputs, timeout_s)
         return
-    with client_of(state) as client:
-        rows = client.children().rows
-        page = c.Resources(0, []) if of == "tree" else client.resources(limit=limit)
+    with connection_of(state) as connection:
+        rows = connection.children().rows
+        page = c.Resources(0, []) if of == "tree" else connection.resources(limit=limit)
     draw = {"mermaid": graphs.mermaid, "dot": graphs.dot, "svg": graphs.svg, "png": graphs.svg}[format]
     say_picture(draw(rows, page.rows, of), format)
     if page.total > len(page.rows):
@@ -290,17 +290,17 @@ def logs(
     """
     if follow and previous:
         raise UsageError("--previous: expected no --follow with it, as a process that has ended logs no more")
-    with client_of(state) as client:
+    with connection_of(state) as connection:
         try:
-            log = log_of(client, child, lines, previous=previous)
+            log = log_of(connection, child, lines, previous=previous)
         except NotFound:
-            if (output := output_of(client, child, lines)) is None:
+            if (output := output_of(connection, child, lines)) is None:
                 raise
             if follow or previous:
                 raise UsageError(f"{child}: expected a child for --follow and --previous, got a program") from None
             say_json(output) if as_json else say_lines("\n".join(output))
             return
-        text = LogText(log.path, [] if as_json else events_of_child(client, log.path))
+        text = LogText(log.path, [] if as_json else events_of_child(connection, log.path))
         _say_log(log.path, log.lines, text, as_json)
         if not log.lines:
             whose = f"{log.path}, of the process before" if previous else log.path
@@ -310,7 +310,7 @@ def logs(
                 say_lines("\n".join(text.end()))
             return
         with suppress(NotRunning):
-            for new in new_lines(client, log.path, log.lines[-1].seq if log.lines else 0):
+            for new in new_lines(connection, log.path, log.lines[-1].seq if log.lines else 0):
                 _say_log(log.path, new, text, as_json)
     say("the system has ended", err=True)
 
@@ -362,39 +362,39 @@ def stream(
     if rate + echo + (save is not None) + (record_file is not None) > 1:
         raise UsageError("stream: expected one of --rate, --echo, --save FILE and --record FILE, got several")
     write = None if save is None else _writer(save)
-    with ConsoleClient(find_console(state)) as client:
-        row = _found(client, id, name)
+    with ConsoleConnection(find_console(state)) as connection:
+        row = _found(connection, id, name)
         if write is not None and save is not None:
-            frame = next(_frames(client, row, timeout_s), None)
+            frame = next(_frames(connection, row, timeout_s), None)
             if frame is None:
                 raise NotFound(f"stream {row.info.name!r}: its resource was unloaded", id=row.info.resource_id)
             _save(save, write, frame)
             say(f"saved frame {frame.number} in {save}")
         elif record_file is not None:
-            _record(client, row, record_file, limit, itertools.islice(_frames(client, row, timeout_s), count))
+            _record(connection, row, record_file, limit, itertools.islice(_frames(connection, row, timeout_s), count))
         elif echo:
-            for frame in itertools.islice(_frames(client, row, timeout_s), count):
+            for frame in itertools.islice(_frames(connection, row, timeout_s), count):
                 _say_frame(frame, as_json)
         else:
-            for one in itertools.islice(_looks(client, row), count):
+            for one in itertools.islice(_looks(connection, row), count):
                 _say_rate(one, as_json)
 
 
-def _found(client: ConsoleClient, id: str, name: str) -> StreamRow:
+def _found(connection: ConsoleConnection, id: str, name: str) -> StreamRow:
     """Return the stream of the resource of this id or name.
 
     Raises:
         NotFound: there is none.
         UsageError: there are several.
     """
-    resources = client.ask(Find(id)).resources
+    resources = connection.ask(Find(id)).resources
     if not resources:
         raise UsageError(f"{shown(id)}: no resource has this id; rr-actors streams lists the streams that there are")
     if len(resources) > 1:
         several = few(f"{row.name} ({short_id(row.id)})" for row in resources)
         raise UsageError(f"{shown(id)}: several resources have this in their ids: {several}; give more of the id")
     (resource,) = resources
-    rows = {row.info.name: row for row in client.streams(match=resource.id).rows}
+    rows = {row.info.name: row for row in connection.streams(match=resource.id).rows}
     names = few(map(repr, rows)) or "none"
     if name and name not in rows:
         raise UsageError(f"{resource.name} has no stream {shown(name)}; it has: {names}{did_you_mean(name, rows)}")
@@ -408,10 +408,10 @@ def _found(client: ConsoleClient, id: str, name: str) -> StreamRow:
 # -- its rate --------------------------------------------------------------------------------------------------------
 
 
-def _looks(client: ConsoleClient, row: StreamRow) -> Iterator[StreamRow | None]:
+def _looks(connection: ConsoleConnection, row: StreamRow) -> Iterator[StreamRow | None]:
     """Yield the stream's row each second; None while it is not open. It ends when the resource is gone."""
-    while client.ask(Find(row.info.resource_id)).resources:
-        found = [one for one in client.streams(match=row.info.resource_id).rows if one.info.name == row.info.name]
+    while connection.ask(Find(row.info.resource_id)).resources:
+        found = [one for one in connection.streams(match=row.info.resource_id).rows if one.info.name == row.info.name]
         yield found[0] if found else None
         time.sleep(_LOOK_S)
     say(f"stream {row.info.name!r}: its resource was unloaded", err=True)
@@ -431,7 +431,7 @@ def _say_rate(row: StreamRow | None, as_json: bool) -> None:
 # -- its frames ------------------------------------------------------------------------------------------------------
 
 
-def _frames(client: ConsoleClient, row: StreamRow, timeout_s: float) -> Iterator[StreamFrame]:
+def _frames(connection: ConsoleConnection, row: StreamRow, timeout_s: float) -> Iterator[StreamFrame]:
     """Yield the newest frames, until the resource is gone.
 
     Raises:
@@ -445,15 +445,17 @@ def _frames(client: ConsoleClient, row: StreamRow, timeout_s: float) -> Iterator
         if (now := time.monotonic()) - looked_at < _LOOK_S:
             return False
         looked_at = now
-        return not client.ask(Find(row.info.resource_id)).resources
+        return not connection.ask(Find(row.info.resource_id)).resources
 
     yield from frames_of(Stream(row.info.resource_id, row.info.name), is_over, timeout_s)
     say(f"stream {row.info.name!r}: its resource was unloaded", err=True)
 
 
-def _record(client: ConsoleClient, row: StreamRow, file: Path, limit: int, frames: Iterator[StreamFrame]) -> None:
+def _record(
+    connection: ConsoleConnection, row: StreamRow, file: Path, limit: int, frames: Iterator[StreamFrame]
+) -> None:
     """Write the frames into a new file, as they come."""
-    response = client.ask(ReadResponse(row.info.resource_id, row.info.server.partition("/")[0])).text
+    response = connection.ask(ReadResponse(row.info.resource_id, row.info.server.partition("/")[0])).text
     writer = StreamWriter(file, _header(row, response), limit)
     written = missed = 0
     try:

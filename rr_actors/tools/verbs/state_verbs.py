@@ -14,7 +14,7 @@ import typer
 from rr_actors.base.errors import UsageError, counted, shown
 from rr_actors.registrar.model.rows import Held, priority_of
 from rr_actors.registrar.pages import priority_text
-from rr_actors.system.console.console_client import find_console
+from rr_actors.system.console.console_connection import find_console
 from rr_actors.system.rewound.rewind_times import time_meant
 from rr_actors.system.rewound.rewinding import Rewound
 from rr_actors.system.rewound.rewinding import rewind as rewound_of

@@ -18,7 +18,7 @@ from nicegui import Client, ui
 from rr_actors.base.errors import RrError, counted
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.console import console_messages as c
-from rr_actors.system.console.console_client import ConsoleClient, find_console
+from rr_actors.system.console.console_connection import ConsoleConnection, find_console
 from rr_actors.system.recording.recordings import Recording, add
 from rr_actors.system.recording.sequence_diagrams import sequence_of
 from rr_actors.system.recording.traces import BEGINNINGS
@@ -42,7 +42,7 @@ class Recorder:
         self._watch = watch
         self._lock = threading.Lock()  # held by the thread that starts or stops it
         self._is_closed = False
-        self._client: ConsoleClient | None = None
+        self._connection: ConsoleConnection | None = None
         self._thread: threading.Thread | None = None
         self.recording = Recording("")
 
@@ -67,13 +67,13 @@ class Recorder:
             self._stop()
             if self._is_closed:
                 return
-            client = ConsoleClient(find_console(self._watch.link.state_dir))
+            connection = ConsoleConnection(find_console(self._watch.link.state_dir))
             try:
-                parts = client.record()
+                parts = connection.record()
             except BaseException:
-                client.close()
+                connection.close()
                 raise
-            self._client, self.recording = client, Recording(client.welcome.system, limit=_LIMIT)
+            self._connection, self.recording = connection, Recording(connection.welcome.system, limit=_LIMIT)
             arguments = (self.recording, parts)
             self._thread = threading.Thread(target=_take, args=arguments, name="rr-web-record", daemon=True)
             self._thread.start()
@@ -89,9 +89,9 @@ class Recorder:
         self.stop()
 
     def _stop(self) -> None:
-        client, self._client, thread, self._thread = self._client, None, self._thread, None
-        if client is not None:
-            client.close()
+        connection, self._connection, thread, self._thread = self._connection, None, self._thread, None
+        if connection is not None:
+            connection.close()
         if thread is not None:
             thread.join()
 

@@ -26,7 +26,7 @@ from rr_actors.streams.stream import Stream
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
 from rr_actors.system.console.attention.attention_questions import Attention, ListAttention
-from rr_actors.system.console.console_client import read_pages
+from rr_actors.system.console.console_connection import read_pages
 from rr_actors.system.console.console_view import Verb
 from rr_actors.system.recording.event_memory import Event
 from rr_actors.system.recording.recordings import entry_of

@@ -1,7 +1,7 @@
 """Calls of an actor's methods from outside: which methods it has for that, one call with plain data, its answer.
 
-A client has no key of the system, so it sends and gets plain data alone. The methods are those that an actor's class
-adds to Actor or Manager: no callbacks of servers, no hooks, nothing private.
+A connected program has no key of the system, so it sends and gets plain data alone. The methods are those that an
+actor's class adds to Actor or Manager: no callbacks of servers, no hooks, nothing private.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from rr_actors.registrar.declarations import Declared, callbacks_of
 from rr_actors.registrar.manager import Manager
 from rr_actors.runtime.callback_errors import traceback_of
 from rr_actors.system.console import console_messages as c
-from rr_actors.system.console.client_registrars import Caller
+from rr_actors.system.console.connected_registrars import Caller
 from rr_actors.system.console.console_view import Command, View
 
 _message = Codec(None, "message")
@@ -158,7 +158,7 @@ class CallActor(Command[c.Replied], frozen=True):
     def _carry_out(self, view: View, caller: Caller) -> c.Replied:
         reply = None
         try:
-            with asking_as(view.clients.asking(caller, "")):
+            with asking_as(view.connected.asking(caller, "")):
                 reply = begin(self.actor, view.system.ref(self.actor), self.method, self.given)
             answer = reply.get(timeout=self.timeout_s)
         except Timeout as late:
@@ -167,12 +167,12 @@ class CallActor(Command[c.Replied], frozen=True):
             text = f"{self.actor}: it has not answered within {self.timeout_s:g} s; a later answer reaches nobody"
             raise Unavailable(text) from late
         except Exception as error:
-            raise as_a_client_hears(self.actor, error) from error
+            raise as_heard_outside(self.actor, error) from error
         return c.Replied(plain_bytes(answer, f"answer of {self.actor}.{self.method}"))
 
 
-def as_a_client_hears(actor: str, error: Exception) -> RrError:
-    """Return the error for the client: one of this package stays of its class, and another is described."""
+def as_heard_outside(actor: str, error: Exception) -> RrError:
+    """Return the error for the connected program: one of this package stays of its class, and another is described."""
     raised = {"actor": actor, "traceback": raised_elsewhere(error) or traceback_of(error)}
     if isinstance(error, RrError):
         if raised["traceback"]:  # by the handler, not on the way to it

@@ -11,8 +11,8 @@ from rr_actors.actors.refs import Timeout
 from rr_actors.base.errors import NotFound, RrError, Unavailable, UsageError, is_a, shown, text_of
 from rr_actors.base.values.canonical import json_of, shown_plain
 from rr_actors.system.console import console_messages as c
-from rr_actors.system.console.asking.actor_calls import as_a_client_hears, plain_bytes
-from rr_actors.system.console.client_registrars import Caller
+from rr_actors.system.console.asking.actor_calls import as_heard_outside, plain_bytes
+from rr_actors.system.console.connected_registrars import Caller
 from rr_actors.system.console.console_questions import Listing
 from rr_actors.system.console.console_view import View, room_for
 from rr_actors.system.snapshots import ask_each
@@ -34,7 +34,7 @@ class ListTables(Listing[c.TablePage], frozen=True):
     timeout_s: c.Seconds = _LOOK_S
 
     def _carry_out(self, view: View, caller: Caller) -> c.TablePage:
-        asker = view.clients.asking(caller, "")
+        asker = view.connected.asking(caller, "")
         wanted = list(self._declared(view))
 
         def ask(one: tuple[str, ActorTable]) -> list[bytes] | RrError:
@@ -46,7 +46,7 @@ class ListTables(Listing[c.TablePage], frozen=True):
             except Timeout:
                 return Unavailable(f"{path}: table {table.name}: no answer within {self.timeout_s:g} s")
             except Exception as error:
-                return as_a_client_hears(path, error)
+                return as_heard_outside(path, error)
 
         answers = ask_each(wanted, ask)
         notes: list[str] = []

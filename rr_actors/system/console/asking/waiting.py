@@ -1,4 +1,4 @@
-"""Waiting until a child of a running system, or a resource, is in a state: for a shell, a client or the application."""
+"""Waiting until a child of a running system, or a resource, is in a state: for any program."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rr_actors.base.errors import NotRunning, Unavailable, UsageError, few, show
 from rr_actors.base.names import child_meant
 from rr_actors.runtime.time_limits import deadline_of, left_until, time_limit
 from rr_actors.system.console import console_messages as c
-from rr_actors.system.console.console_client import ConsoleClient
+from rr_actors.system.console.console_connection import ConsoleConnection
 from rr_actors.system.console.console_questions import Find
 
 CHILD_STATES = ("running", "starting", "restarting", "stopped")
@@ -22,7 +22,7 @@ _LOOKS_S = 0.02  # between two looks at one that does
 _TICK_S = 0.5  # while nothing happens, so often
 
 
-def wait_for(connect: Callable[[], ConsoleClient], target: str, wanted: str, timeout_s: float) -> tuple[bool, str]:
+def wait_for(connect: Callable[[], ConsoleConnection], target: str, wanted: str, timeout_s: float) -> tuple[bool, str]:
     """Wait until a child or a resource is in a state.
 
     Args:
@@ -61,7 +61,7 @@ def check_state(wanted: str, field: str) -> None:
         raise UsageError(f"{field}: expected {', '.join(known)}, got {shown(wanted)}")
 
 
-def patiently(connect: Callable[[], ConsoleClient], deadline: float) -> ConsoleClient:
+def patiently(connect: Callable[[], ConsoleConnection], deadline: float) -> ConsoleConnection:
     """Connect to a system, which need not run yet.
 
     Raises:
@@ -76,7 +76,7 @@ def patiently(connect: Callable[[], ConsoleClient], deadline: float) -> ConsoleC
             time.sleep(_AGAIN_S)
 
 
-def _looks(hearing: ConsoleClient, deadline: float) -> Iterator[None]:
+def _looks(hearing: ConsoleConnection, deadline: float) -> Iterator[None]:
     """Yield at once, and then whenever something may have changed, until the time limit.
 
     Raises:
@@ -93,7 +93,7 @@ def _looks(hearing: ConsoleClient, deadline: float) -> Iterator[None]:
     raise NotRunning(f"the system in {hearing.welcome.state_dir} has ended")
 
 
-def child_of(asking: ConsoleClient, target: str) -> c.ChildRow | None:
+def child_of(asking: ConsoleConnection, target: str) -> c.ChildRow | None:
     """Return the child of this path or id; None if there is none.
 
     Raises:
@@ -104,7 +104,7 @@ def child_of(asking: ConsoleClient, target: str) -> c.ChildRow | None:
     return None if path is None else rows[path]
 
 
-def _states_of(asking: ConsoleClient, target: str) -> list[str]:
+def _states_of(asking: ConsoleConnection, target: str) -> list[str]:
     """Return the state of the child of this name, or the last status and the phase of the resource; else GONE."""
     if (child := child_of(asking, target)) is not None:
         return [child.state]
@@ -118,7 +118,7 @@ def _states_of(asking: ConsoleClient, target: str) -> list[str]:
 
 
 def waited_for(
-    connect: Callable[[], ConsoleClient],
+    connect: Callable[[], ConsoleConnection],
     target: str,
     wanted: str,
     timeout_s: float | None,

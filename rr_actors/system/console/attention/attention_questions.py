@@ -10,7 +10,7 @@ from rr_actors.base.errors import NotFound, few, shown
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.attention.attention_items import AttentionItem, needs_attention
 from rr_actors.system.console.attention.attention_sources import known_of
-from rr_actors.system.console.client_registrars import Caller
+from rr_actors.system.console.connected_registrars import Caller
 from rr_actors.system.console.console_view import Command, Look, View
 
 

@@ -13,7 +13,7 @@ from rr_actors.hosting.forwarded_logs import LogLine
 from rr_actors.registrar.pages import LoadRow, ResourceRow
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console import console_questions as questions
-from rr_actors.system.console.console_client import read_pages
+from rr_actors.system.console.console_connection import read_pages
 from rr_actors.system.recording.event_texts import ago, clock
 from rr_actors.tools.explanations import seconds_text
 from rr_actors.tools.process_usage import usage_of

@@ -1,4 +1,4 @@
-"""The queries of a client: the news of them that the system sends, how they end with it, and how they come back.
+"""The queries of a connected program: the news of them, how they end with the system, and how they come back.
 
 A thread of each registrar waits for statuses. When the system ends, the thread ends the registrar's queries. With
 `rr.connect(reconnect=True)` it opens the registrar in the next run of the system, and has its queries loaded again.
@@ -36,14 +36,14 @@ from rr_actors.registrar.model.rows import State
 from rr_actors.registrar.queries import Query, Response, Status, StatusCallback, StatusCallbacks, end, hear, received
 from rr_actors.runtime.callback_errors import described, log_raised
 from rr_actors.runtime.user_loop import CallersLoop
-from rr_actors.system.console.console_client import GREETING_S, Connections, ConsoleClient, find_console
 from rr_actors.system.console.console_commands import OpenRegistrar
+from rr_actors.system.console.console_connection import GREETING_S, Connections, ConsoleConnection, find_console
 from rr_actors.system.console.console_messages import Dropped, Heard, Holding, Welcome
 
 logger = Log("rr_actors")
 
 ENDED, AGAIN = "ended", "reconnected"
-"""The reasons of the statuses of a client's query when the system has ended, and when its next run holds it."""
+"""The reasons of the statuses of a connection's query when the system has ended, and when its next run holds it."""
 
 _ANSWER_S = 60.0  # for a request that has no time limit of its own
 
@@ -67,7 +67,7 @@ class SystemConnections(Connections):
         self.welcome: Welcome | None = None
         self.ended: NotRunning | None = None
 
-    def open(self, greeting_s: float = GREETING_S) -> ConsoleClient:
+    def open(self, greeting_s: float = GREETING_S) -> ConsoleConnection:
         """Return a new connection, as Connections.open() does."""
         if self.ended is not None and not (self.is_closed or self.reconnects):
             raise self.has_ended()
@@ -81,31 +81,31 @@ class SystemConnections(Connections):
         return opened
 
     @contextmanager
-    def lent(self, greeting_s: float = GREETING_S) -> Generator[ConsoleClient]:
+    def lent(self, greeting_s: float = GREETING_S) -> Generator[ConsoleConnection]:
         """Lend a connection, as Connections.lent() does."""
         if self.reconnects:
             self.drop_ended()
-        with super().lent(greeting_s) as client:
+        with super().lent(greeting_s) as connection:
             try:
-                yield client
+                yield connection
             except NotRunning as error:
-                if self.is_closed or not client.has_ended:  # an actor that was asked may raise it, too
+                if self.is_closed or not connection.has_ended:  # an actor that was asked may raise it, too
                     raise
                 raise self.has_ended() from error
 
     def has_ended(self) -> NotRunning:
         """Return the error that says that the system has ended, and note that it has."""
-        then = "this client waits for its next run" if self.reconnects else "connect to its next run"
+        then = "this connection waits for its next run" if self.reconnects else "connect to its next run"
         self.ended = NotRunning(f"the system in {self._state_dir} has ended: {then}")
         return self.ended
 
 
-class ClientQuery(Query[Response]):
-    """A client's hold on one resource: a Query. As a context manager it is released at the end.
+class ConnectedQuery(Query[Response]):
+    """A connection's hold on one resource: a Query. As a context manager it is released at the end.
 
     Statuses reach it a moment later than a query of the application. A class in a response of which no type is known
-    is read as a dict. After a restart of the system, a client that reconnects holds the resource again, or one that was
-    loaded for the same request: `id` stays, `resource_id` and `response` are the new ones.
+    is read as a dict. After a restart of the system, a connection that reconnects holds the resource again, or one that
+    was loaded for the same request: `id` stays, `resource_id` and `response` are the new ones.
     """
 
     __slots__ = ("_asked", "_given", "_held_as", "_lost")
@@ -141,37 +141,37 @@ class ClientQuery(Query[Response]):
         return True
 
     def __repr__(self) -> str:
-        return f"<ClientQuery {self.id} of {self.origin} on {self.server_id}>"
+        return f"<ConnectedQuery {self.id} of {self.origin} on {self.server_id}>"
 
 
 _EARLY = 1000
 
 
 # For this package's own modules. As private names they stay out of an editor's list of names.
-lose = ClientQuery._lose  # pyright: ignore[reportPrivateUsage]  # same file
-hold_again = ClientQuery._hold_again  # pyright: ignore[reportPrivateUsage]
+lose = ConnectedQuery._lose  # pyright: ignore[reportPrivateUsage]  # same file
+hold_again = ConnectedQuery._hold_again  # pyright: ignore[reportPrivateUsage]
 
 
-def is_lost(query: ClientQuery) -> bool:
+def is_lost(query: ConnectedQuery) -> bool:
     """Return whether the system has ended while the query was held, and its next run does not hold it."""
     return query._lost is not None  # pyright: ignore[reportPrivateUsage]  # same file
 
 
-def asked_with(query: ClientQuery) -> tuple[bytes, LoadOptions]:
+def asked_with(query: ConnectedQuery) -> tuple[bytes, LoadOptions]:
     """Return the request's canonical bytes, and the options of the load."""
     return query._given, query._asked  # pyright: ignore[reportPrivateUsage]  # same file
 
 
-def held_as(query: ClientQuery) -> str:
+def held_as(query: ConnectedQuery) -> str:
     """Return the id by which the system's present run holds the query."""
     return query._held_as  # pyright: ignore[reportPrivateUsage]  # same file
 
 
-class ClientViews:
-    """The queries that a client's registrar holds, and the status callbacks. Statuses are passed on one by one.
+class ConnectedViews:
+    """The queries that a connection's registrar holds, and the status callbacks. Statuses are passed on one by one.
 
     Args:
-        is_open: returns whether the client has the registrar open. When it has not, no callback begins any more.
+        is_open: returns whether the connection has the registrar open. When it has not, no callback begins any more.
         is_connected: returns whether the system's side is open, too. When it is not, the one status that a callback
             still hears is that the system has ended.
     """
@@ -180,9 +180,9 @@ class ClientViews:
         self.is_open = is_open
         self._is_connected = is_connected
         self._lock = threading.Lock()
-        self._held: dict[str, ClientQuery] = {}
+        self._held: dict[str, ConnectedQuery] = {}
         self.callbacks = StatusCallbacks(self._hears, set())
-        self._again: dict[str, ClientQuery] = {}  # those held after a restart of the system, by their new ids
+        self._again: dict[str, ConnectedQuery] = {}  # those held after a restart of the system, by their new ids
         self._loads = 0  # in flight
         self._early: dict[str, list[Heard | Dropped]] = {}  # of loads whose answers have not been read yet
         self._news: deque[Callable[[], None]] = deque()  # what is to be passed on
@@ -201,7 +201,7 @@ class ClientViews:
                 if not self._loads:
                     self._early.clear()
 
-    def add(self, query: ClientQuery, options: LoadOptions) -> None:
+    def add(self, query: ConnectedQuery, options: LoadOptions) -> None:
         """Have statuses reach a query and its callback."""
         own = None if options.on_status is None else described(options.on_status, "load: on_status")
         with self._lock:
@@ -210,7 +210,7 @@ class ClientViews:
             self._take_early(query, query.id)
         self.pass_on()
 
-    def find(self, query_id: str) -> ClientQuery | None:
+    def find(self, query_id: str) -> ConnectedQuery | None:
         """Return the query of this id that is held; None else."""
         return self._held.get(query_id)
 
@@ -270,11 +270,11 @@ class ClientViews:
             finally:
                 self._passing_on.release()
 
-    def _take_early(self, query: ClientQuery, id: str) -> None:
+    def _take_early(self, query: ConnectedQuery, id: str) -> None:
         for heard in self._early.pop(id, ()):
             self._take(query, heard)
 
-    def _take(self, query: ClientQuery, heard: Heard | Dropped) -> None:
+    def _take(self, query: ConnectedQuery, heard: Heard | Dropped) -> None:
         if isinstance(heard, Dropped):
             self._news.append(functools.partial(self.forget, query.id, ""))
         else:
@@ -291,7 +291,7 @@ class ClientViews:
         for query in self._all():
             self.give_up(query, error)
 
-    def give_up(self, query: ClientQuery, error: RrError) -> None:
+    def give_up(self, query: ConnectedQuery, error: RrError) -> None:
         """End a query that the system's next run does not hold, if there is one: it hears FATAL."""
         lose(query, error)
         self._say(query, State.FATAL, error.message, ENDED, released=True)
@@ -305,7 +305,7 @@ class ClientViews:
             self._say(query, State.ERROR, error.message, ENDED)
         self.pass_on()
 
-    def all_away(self) -> list[ClientQuery]:
+    def all_away(self) -> list[ConnectedQuery]:
         """Return the queries that wait for the system's next run, the oldest first."""
         return list(filter(is_lost, self._all()))
 
@@ -313,7 +313,7 @@ class ClientViews:
         """Return whether a query waits for the system's next run."""
         return (query := self._held.get(query_id)) is not None and is_lost(query)
 
-    def hold_again(self, query: ClientQuery, held: Holding) -> bool:
+    def hold_again(self, query: ConnectedQuery, held: Holding) -> bool:
         """Note that the system's next run holds a query, which hears so with the next pass_on().
 
         Return False if the query was released meanwhile, or is held by an earlier call.
@@ -328,13 +328,13 @@ class ClientViews:
             self._take_early(query, held.query_id)
         return True
 
-    def _all(self) -> list[ClientQuery]:
+    def _all(self) -> list[ConnectedQuery]:
         with self._lock:
             return list(self._held.values())
 
     def _say(
         self,
-        query: ClientQuery,
+        query: ConnectedQuery,
         state: State,
         text: str,
         reason: str,
@@ -347,7 +347,7 @@ class ClientViews:
         status.reason = reason
         self._news.append(lambda: self._tell(query, status, response, released=released))
 
-    def _tell(self, query: ClientQuery, status: Status, response: bytes | None, *, released: bool) -> None:
+    def _tell(self, query: ConnectedQuery, status: Status, response: bytes | None, *, released: bool) -> None:
         hear(query, received(status, self.find), response, released=released)
         for listener in self.callbacks.of(query.id, query.server_id):
             try:
@@ -363,7 +363,7 @@ class ClientViews:
 
 
 def status_heard(heard: Heard) -> Status:
-    """Return the status that has reached a client's query."""
+    """Return the status that has reached a connection's query."""
     place = {"resource_id": heard.resource_id, "query_id": heard.query_id, "source": heard.source}
     status = Status(heard.state, heard.message, repeated=heard.repeated, **place)
     status.reason, status.deadline_s = heard.reason, heard.deadline_s
@@ -379,12 +379,12 @@ async def _await(answer: Awaitable[object]) -> None:
 _RETRY_S = 0.1  # between two looks for the next run, or for a manager that starts
 _AT_ONCE = 8  # loads of one registrar after a restart
 
-Load = Callable[[ClientQuery], None]
+Load = Callable[[ConnectedQuery], None]
 """Loads the resource of a query again."""
 
 
 class Lifeline:
-    """The connection by which a registrar is open in the system; another one after each restart.
+    """The socket by which a registrar is open in the system; another one after each restart.
 
     Args:
         wanted: the name that the registrar is opened with.
@@ -399,7 +399,7 @@ class Lifeline:
         self._closed = threading.Event()
         self._is_away = False
         self.name = ""
-        self.client = self._opened()
+        self.socket = self._opened()
 
     @property
     def is_closed(self) -> bool:
@@ -408,7 +408,7 @@ class Lifeline:
 
     def is_open(self) -> bool:
         """Return whether the system's side is open, too."""
-        return self.client.is_open()
+        return self.socket.is_open()
 
     def check_here(self) -> None:
         """Raise NotRunning while the registrar waits for the next run of the system."""
@@ -419,17 +419,17 @@ class Lifeline:
         """Wait for the next run of the system, and open the registrar there. Return False if it was closed here.
 
         Raises:
-            RrError: the next run refuses it: another client has the name, say.
+            RrError: the next run refuses it: another connection has the name, say.
         """
         self._is_away = True
         while not self._closed.wait(_RETRY_S) and not self.connections.is_closed:
             try:
-                self.client = self._opened()
+                self.socket = self._opened()
             except Unavailable:  # NotRunning is one
                 continue
             self._is_away = False
             if self._closed.is_set():
-                self.client.close()
+                self.socket.close()
                 break
             return True
         return False
@@ -437,9 +437,9 @@ class Lifeline:
     def close(self) -> None:
         """Close the registrar, whose queries are released a moment later. A second close does nothing."""
         self._closed.set()
-        self.client.close()
+        self.socket.close()
 
-    def _opened(self) -> ConsoleClient:
+    def _opened(self) -> ConsoleConnection:
         opened = self.connections.open()
         try:
             self.name = opened.ask(OpenRegistrar(self._wanted)).facts["registrar"]
@@ -449,7 +449,9 @@ class Lifeline:
         return opened
 
 
-def listen(lifeline: Lifeline, views_of: Callable[[], ClientViews | None], load_of: Callable[[], Load | None]) -> None:
+def listen(
+    lifeline: Lifeline, views_of: Callable[[], ConnectedViews | None], load_of: Callable[[], Load | None]
+) -> None:
     """Pass on the statuses of a registrar, until it is closed or nobody has it any more. In a thread of its own.
 
     Args:
@@ -477,11 +479,11 @@ def listen(lifeline: Lifeline, views_of: Callable[[], ClientViews | None], load_
         views.end()
 
 
-def _until_its_end(lifeline: Lifeline, views_of: Callable[[], ClientViews | None]) -> NotRunning | None:
+def _until_its_end(lifeline: Lifeline, views_of: Callable[[], ConnectedViews | None]) -> NotRunning | None:
     """Pass on statuses until the system ends, and return the error that says so; None: the registrar was closed."""
     try:
         while True:
-            statuses = lifeline.client.wait_statuses(lifeline.name)
+            statuses = lifeline.socket.wait_statuses(lifeline.name)
             views = views_of()
             if views is None:
                 return None
@@ -496,13 +498,13 @@ def _until_its_end(lifeline: Lifeline, views_of: Callable[[], ClientViews | None
         return None
 
 
-def _load_again(views_of: Callable[[], ClientViews | None], load: Load) -> None:
+def _load_again(views_of: Callable[[], ConnectedViews | None], load: Load) -> None:
     """Have threads load all that the registrar held, the oldest first."""
     views = views_of()
     if views is None:
         return
 
-    def one(query: ClientQuery) -> None:
+    def one(query: ConnectedQuery) -> None:
         try:
             _patiently(load, query)
         except NotRunning:
@@ -522,7 +524,7 @@ def _load_again(views_of: Callable[[], ClientViews | None], load: Load) -> None:
         threading.Thread(target=work, name="rr-reconnect", daemon=True).start()
 
 
-def _patiently(load: Load, query: ClientQuery) -> None:
+def _patiently(load: Load, query: ConnectedQuery) -> None:
     """Load, also if the manager is not there yet: the system may still be starting."""
     limit_s = asked_with(query)[1].timeout_s
     deadline = None if limit_s is None else time.monotonic() + limit_s

@@ -1,4 +1,4 @@
-"""A client asks an actor: the actor hears who asks, and the client hears what went wrong, and where."""
+"""A connection asks an actor: the actor hears who asks, and the connection hears what went wrong, and where."""
 
 from __future__ import annotations
 
@@ -70,49 +70,49 @@ def system(state_dir: Path, placement: Literal["process", "thread"]) -> Iterator
 
 
 @pytest.fixture
-def client(system: rr.System, state_dir: Path) -> Iterator[rr.Client]:
-    with rr.connect(state_dir) as client:
-        yield client
+def connection(system: rr.System, state_dir: Path) -> Iterator[rr.Connection]:
+    with rr.connect(state_dir) as connection:
+        yield connection
 
 
-def test_a_handler_hears_who_asks(system: rr.System, client: rr.Client) -> None:
-    anna, bert = client.open_registrar("anna"), client.open_registrar("bert")
+def test_a_handler_hears_who_asks(system: rr.System, connection: rr.Connection) -> None:
+    anna, bert = connection.open_registrar("anna"), connection.open_registrar("bert")
     bench = system.ref("bench")
 
-    assert anna.ask("bench", "who asks") == "client.anna"
-    assert bert.ask("bench", "who asks") == "client.bert"
-    assert client.ask("bench", "who asks") == f"client.pid-{os.getpid()}"
+    assert anna.ask("bench", "who asks") == "connection.anna"
+    assert bert.ask("bench", "who asks") == "connection.bert"
+    assert connection.ask("bench", "who asks") == f"connection.pid-{os.getpid()}"
     assert bench.ask("who asks") == ""
     assert system.ref("asking").ask(("waits", bench)) == "root/asking"
     assert system.ref("asking").ask(("does not", bench)) == ""
     with anna.load("bench/scope", "big") as scope:
-        assert scope.response == "big for client.anna"
+        assert scope.response == "big for connection.anna"
         assert anna.ask("bench", "volt") == 1.25
-        with pytest.raises(rr.UsageError, match=r"client\.bert does not hold the scope") as caught:
+        with pytest.raises(rr.UsageError, match=r"connection\.bert does not hold the scope") as caught:
             bert.ask("bench", "volt")
         assert "does not hold the scope" in caught.value.__notes__[0]
 
 
-def test_nobody_asks_in_the_name_of_another_client(
-    system: rr.System, client: rr.Client, state_dir: Path, monkeypatch: pytest.MonkeyPatch
+def test_nobody_asks_in_the_name_of_another_connection(
+    system: rr.System, connection: rr.Connection, state_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    anna = client.open_registrar("anna")
+    anna = connection.open_registrar("anna")
     with rr.connect(state_dir) as other:
         mine = other.open_registrar("bert")
-        monkeypatch.setattr(mine, "_name", anna.name)  # as a client would that was changed
-        with pytest.raises(UnknownRegistrar, match=r"'client\.anna': another client has opened it"):
+        monkeypatch.setattr(mine, "_name", anna.name)  # as a connection would that was changed
+        with pytest.raises(UnknownRegistrar, match=r"'connection\.anna': another connection has opened it"):
             mine.ask("bench", "who asks")
 
 
-def test_the_context_of_a_message_is_of_no_resource(client: rr.Client) -> None:
+def test_the_context_of_a_message_is_of_no_resource(connection: rr.Connection) -> None:
     for message in ("progress", "load"):
         with pytest.raises(rr.UsageError, match="expected that of a callback, got that of a message"):
-            client.ask("bench", message)
+            connection.ask("bench", message)
 
 
-def test_an_exception_of_a_handler_has_its_class_and_its_traceback(client: rr.Client) -> None:
+def test_an_exception_of_a_handler_has_its_class_and_its_traceback(connection: rr.Connection) -> None:
     with pytest.raises(rr.AskFailed, match=r"^bench: KeyError: 5\n") as caught:
-        client.ask("bench", "key")
+        connection.ask("bench", "key")
 
     error = caught.value
     assert (error.actor, error.error) == ("bench", "KeyError")
@@ -120,22 +120,22 @@ def test_an_exception_of_a_handler_has_its_class_and_its_traceback(client: rr.Cl
     assert error.__notes__ == [f"raised in bench:\n{error.traceback}"]
 
 
-def test_a_handler_that_raises_not_running_does_not_end_the_client(client: rr.Client) -> None:
+def test_a_handler_that_raises_not_running_does_not_end_the_connection(connection: rr.Connection) -> None:
     with pytest.raises(rr.NotRunning, match=r"^no scope runs"):
-        client.ask("bench", "not running")
+        connection.ask("bench", "not running")
 
-    assert client.ended is None
-    assert client.ask("bench", "who asks").startswith("client.pid-")
+    assert connection.ended is None
+    assert connection.ask("bench", "who asks").startswith("connection.pid-")
 
 
-def test_a_message_with_an_object_is_refused_with_advice_that_applies(client: rr.Client) -> None:
+def test_a_message_with_an_object_is_refused_with_advice_that_applies(connection: rr.Connection) -> None:
     for message, got in ((Open(1), "an Open"), ([{"a": Open(1)}], "an Open"), (lambda: 1, "function")):
         with pytest.raises(
             rr.NotSerializable, match=f"message to bench: expected numbers.*got .*{got}.*fields"
         ) as told:
-            client.ask("bench", message)
+            connection.ask("bench", message)
         assert "dataclass" not in str(told.value)
         assert "load callback" not in str(told.value)
-    with pytest.raises(rr.NotSerializable, match="over a client's limit"):
-        client.ask("bench", "x" * 1_000_000)
-    assert client.ask("bench", dataclasses.asdict(Open(1))) == {"port": 1}
+    with pytest.raises(rr.NotSerializable, match="over a connection's limit"):
+        connection.ask("bench", "x" * 1_000_000)
+    assert connection.ask("bench", dataclasses.asdict(Open(1))) == {"port": 1}

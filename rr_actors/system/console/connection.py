@@ -1,8 +1,8 @@
-"""connect(): a client of a running system, for any other process of the same user: a worker of a pool, a notebook.
+"""connect(): a connection to a running system, for any other process of the same user, a worker of a pool, a notebook.
 
-The client speaks with the system's console, has no key of the system, and opens no pickle but the frames of streams.
-Registrars in the application's process hold its queries. Each registrar has a connection of its own, which ends with
-the client.
+It speaks with the system's console, has no key of the system, and opens no pickle but the frames of streams.
+Registrars in the application's process hold its queries. Each registrar has a socket of its own, which ends with the
+connection.
 """
 
 from __future__ import annotations
@@ -51,19 +51,19 @@ from rr_actors.registrar.remote_registrar import RemoteCalls, RemoteGroup, Remot
 from rr_actors.runtime.time_limits import deadline_of, left_until, time_limit
 from rr_actors.system.backups import WRITING_S, Backup, read_backup
 from rr_actors.system.console import console_messages as c
-from rr_actors.system.console.asking.client_proxies import GRACE_S, ClientProxy, in_thread
+from rr_actors.system.console.asking.connected_proxies import GRACE_S, ConnectedProxy, in_thread
 from rr_actors.system.console.asking.waiting import waited_for
-from rr_actors.system.console.client_queries import (
-    ClientQuery,
-    ClientViews,
+from rr_actors.system.console.connected_queries import (
+    ConnectedQuery,
+    ConnectedViews,
     Lifeline,
     Load,
     SystemConnections,
     asked_with,
     listen,
 )
-from rr_actors.system.console.console_client import GREETING_S, find_console
 from rr_actors.system.console.console_commands import AskActor, BackUp, GivePriority, Hold, Release
+from rr_actors.system.console.console_connection import GREETING_S, find_console
 from rr_actors.system.console.console_messages import TIMEOUT_LIMIT_S, VALUE_LIMIT_BYTES
 from rr_actors.system.console.console_questions import Find, FindServer, HasAllStreams
 
@@ -74,8 +74,8 @@ logger = Log("rr_actors")
 _RETRY_S = 0.05  # between two looks for a system that is awaited
 
 
-class Client:
-    """A client of a running system. connect() makes it; as a context manager it is closed at the end. From any thread.
+class Connection:
+    """A connection to a running system. connect() makes it; a context manager closes it at the end. From any thread.
 
     When the system ends, each query of its registrars hears FATAL with the reason "ended", and calls raise NotRunning.
     With `reconnect=True` it hears ERROR, and calls raise NotRunning until the system's next run.
@@ -87,46 +87,47 @@ class Client:
 
     def __init__(self, run_dir: Path, *, reconnect: bool = False) -> None:
         self._connections = SystemConnections(run_dir, reconnects=reconnect)
-        with self._connections.lent() as client:
-            welcome = client.welcome
+        with self._connections.lent() as socket:
+            welcome = socket.welcome
         self.system = welcome.system
         self.state_dir = Path(welcome.state_dir)
 
     @property
     def pid(self) -> int:
-        """The id of the system's process, or of the last one that this client has met."""
+        """The id of the system's process, or of the last one that this connection has met."""
         assert self._connections.welcome is not None
         return self._connections.welcome.pid
 
     @property
     def ended(self) -> NotRunning | None:
-        """The error that says that the system has ended; None while it runs, or if this client was closed first."""
+        """The error that says that the system has ended; None while it runs, or if this side was closed first."""
         if self._connections.ended is None or self._connections.reconnects:
             try:
                 self._connections.open().close()
             except NotRunning:
-                pass  # it is noted, unless this client is closed
+                pass  # it is noted, unless this connection is closed
             except Unavailable:
                 return None  # it runs, and is busy
         return self._connections.ended
 
-    def open_registrar(self, name: str | None = None) -> ClientRegistrar:
-        """Open a registrar for this client. When the client ends, it is closed, and its queries are released.
+    def open_registrar(self, name: str | None = None) -> ConnectedRegistrar:
+        """Open a registrar for this connection, whose end closes it and releases its queries.
 
         Args:
-            name: the registrar's name, before which the system puts "client."; None: "pid-" and this process's id.
+            name: the registrar's name, before which the system puts "connection."; None: "pid-" and this
+                process's id.
 
         Raises:
-            NameTaken: another client has this name.
+            NameTaken: another connection has this name.
             InvalidName: the name has characters that no name may have.
             NotRunning: the system has ended.
         """
-        return ClientRegistrar(self._connections, f"pid-{os.getpid()}" if name is None else name)
+        return ConnectedRegistrar(self._connections, f"pid-{os.getpid()}" if name is None else name)
 
     def ask(self, actor: str, message: Any, *, timeout_s: float | None = 30.0) -> Any:
         """Ask an actor of the system, and return its answer. Both are plain data, as requests are (docs/values.md).
 
-        The handler sees who asks as `rr.current().origin`: "client.pid-" and the number of this process.
+        The handler sees who asks as `rr.current().origin`: "connection.pid-" and the number of this process.
 
         Args:
             actor: its id or its path, as for System.ref().
@@ -139,14 +140,14 @@ class Client:
         """
         return _asked(self._connections, actor, message, timeout_s)
 
-    def proxy(self, actor: str, *, timeout_s: float | None = 30.0) -> ClientProxy:
+    def proxy(self, actor: str, *, timeout_s: float | None = 30.0) -> ConnectedProxy:
         """Return an object whose methods are those of an actor of the system; each call returns a future.
 
         Args:
             actor: its id or its path, as for System.ref().
             timeout_s: how long each call may take. None: a day.
         """
-        return ClientProxy(self._connections, actor, _limit(timeout_s))
+        return ConnectedProxy(self._connections, actor, _limit(timeout_s))
 
     def wait_for(self, id: str, state: str = "", *, timeout_s: float | None = 30.0) -> str:
         """Wait until a child or a resource is in a state, as System.wait_for() does, with its errors."""
@@ -162,8 +163,8 @@ class Client:
         return read_backup(path)
 
     def close(self) -> None:
-        """Close all registrars and connections. Their queries are released soon after. A second close does nothing."""
-        self._connections.close("the client is closed")
+        """Close all registrars. Their queries are released soon after. A second close does nothing."""
+        self._connections.close("the connection is closed")
 
     def __enter__(self) -> Self:
         return self
@@ -172,7 +173,7 @@ class Client:
         self.close()
 
     def __repr__(self) -> str:
-        return f"<Client of {self.system} (pid {self.pid}) in {self.state_dir}>"
+        return f"<Connection of {self.system} (pid {self.pid}) in {self.state_dir}>"
 
 
 class _Given(bytes):
@@ -181,17 +182,17 @@ class _Given(bytes):
     value: Any
 
 
-NOT_FOR_CLIENTS = {
+NOT_FOR_CONNECTIONS = {
     "force": "only the application takes a resource away from its holders",
-    "parent": "a client serves nothing, so no resource of it can need another",
+    "parent": "a connection serves nothing, so no resource of it can need another",
 }
-"""The options of a registrar's calls that a client may not use, and why. It has no methods that serve or look."""
+"""The options of a registrar's calls that a connection may not use, and why. It has no methods that serve or look."""
 
 
-class _ClientCalls(RemoteCalls):
-    """The calls of a client's registrar: requests to the system's console, of plain data, never pickles."""
+class _ConnectedCalls(RemoteCalls):
+    """The calls of a connection's registrar: requests to the system's console, of plain data, never pickles."""
 
-    def __init__(self, lifeline: Lifeline, views: ClientViews) -> None:
+    def __init__(self, lifeline: Lifeline, views: ConnectedViews) -> None:
         super().__init__(lifeline.name)
         self.connections = lifeline.connections
         self.check_here = lifeline.check_here
@@ -233,12 +234,12 @@ class _ClientCalls(RemoteCalls):
         return has_all
 
 
-class _ClientLoads(RemoteLoads):
-    """The loads of a client's registrar. Each call in flight has a thread and a connection."""
+class _ConnectedLoads(RemoteLoads):
+    """The loads of a connection's registrar. Each call in flight has a thread and a socket."""
 
-    def __init__(self, calls: _ClientCalls, holder: Holder) -> None:
+    def __init__(self, calls: _ConnectedCalls, holder: Holder) -> None:
         super().__init__(calls, holder)
-        self._client = calls
+        self._calls = calls
 
     def wait(self, target: ServerId, request: bytes, parent: str, options: LoadOptions) -> Query:
         """Load a resource in the calling thread."""
@@ -262,26 +263,26 @@ class _ClientLoads(RemoteLoads):
         return query
 
     def _load(self, target: ServerId, request: bytes, options: LoadOptions) -> Query:
-        client, limit_s = self._client, _limit(options.timeout_s)
+        calls, limit_s = self._calls, _limit(options.timeout_s)
         deadline = deadline_of(limit_s + GRACE_S)
-        client.check_here()
+        calls.check_here()
         wait_s = None if options.wait_s is None else _limit(options.wait_s)
-        command = Hold(client.name, str(target), bytes(request), limit_s, options.priority, wait_s)
-        query: ClientQuery | None = None
+        command = Hold(calls.name, str(target), bytes(request), limit_s, options.priority, wait_s)
+        query: ConnectedQuery | None = None
         try:
-            # If the connection ends before keep(), the system releases the query.
-            with client.views.loading(), client.connections.lent(min(GREETING_S, limit_s + GRACE_S)) as connection:
-                held = connection.ask(command, left_until(deadline))
+            # If the socket ends before keep(), the system releases the query.
+            with calls.views.loading(), calls.connections.lent(min(GREETING_S, limit_s + GRACE_S)) as socket:
+                held = socket.ask(command, left_until(deadline))
                 server = parse_server_id(held.server) if held.server else target
-                place = held.query_id, server, request, "", client.name, self.holder, _shown_types, client.all_streams
-                query = ClientQuery(place, bytes(request), options)
+                place = held.query_id, server, request, "", calls.name, self.holder, _shown_types, calls.all_streams
+                query = ConnectedQuery(place, bytes(request), options)
                 if options.codec is not None:
                     read_as(query, options.codec)
                 loaded_directly(query, held.resource_id, held.response, held.state)
                 was_given(query, getattr(request, "value", None))
                 _ = query.response  # an error of its type is one of the load
-                client.views.add(query, options)
-                connection.keep()
+                calls.views.add(query, options)
+                socket.keep()
             return query
         except BaseException as error:  # also KeyboardInterrupt: the caller never gets the query
             if type(error) is Unavailable and time.monotonic() >= deadline:
@@ -290,21 +291,21 @@ class _ClientLoads(RemoteLoads):
                 threading.Thread(target=self.release, args=(query,), name="rr-undo").start()
             raise
 
-    def load_again(self, query: ClientQuery) -> None:
+    def load_again(self, query: ConnectedQuery) -> None:
         """Load the resource of a query in the system's next run, if it is still wanted.
 
         Raises:
             RrError: it cannot be loaded.
         """
-        client, (request, options) = self._client, asked_with(query)
+        calls, (request, options) = self._calls, asked_with(query)
         limit_s = _limit(options.timeout_s)
-        command = Hold(client.name, query.server_id, request, limit_s, options.priority)
-        with client.views.loading(), client.connections.lent() as connection:
-            if client.views.is_away(query.id):
-                held = connection.ask(command, limit_s + GRACE_S)
-                if client.views.hold_again(query, held):
-                    connection.keep()
-        client.views.pass_on()
+        command = Hold(calls.name, query.server_id, request, limit_s, options.priority)
+        with calls.views.loading(), calls.connections.lent() as socket:
+            if calls.views.is_away(query.id):
+                held = socket.ask(command, limit_s + GRACE_S)
+                if calls.views.hold_again(query, held):
+                    socket.keep()
+        calls.views.pass_on()
 
     def _load_all(self, requests: Sequence[LoadWanted], options: LoadOptions) -> Queries:
         sent: list[Reply[Query]] = []
@@ -334,36 +335,36 @@ def _raise_of(one: Reply[Query], requests: Sequence[LoadWanted], place: int) -> 
         raise
 
 
-class ClientRegistrar(Consumer):
-    """A client's registrar: it loads, holds and releases, as Registrar does. A context manager closes it at the end.
+class ConnectedRegistrar(Consumer):
+    """A connection's registrar: it loads, holds and releases, as Registrar does. A context manager closes it.
 
-    Call it from any thread. A thread of the client runs the status callbacks, one after the other. A load without a
-    time limit takes a day at most. Its calls raise two more errors than those of Registrar. NotRunning: the system has
-    ended, or the client is closed. NotSerializable: a request is over 900,000 bytes, or a response over 4 MiB.
+    Call it from any thread. A thread of its own runs the status callbacks, one after the other. A load without a time
+    limit takes a day at most. Its calls raise two more errors than those of Registrar. NotRunning: the system has
+    ended, or the connection is closed. NotSerializable: a request is over 900,000 bytes, or a response over 4 MiB.
 
     Attributes:
-        name: the registrar's name in the system, "client.NAME".
+        name: the registrar's name in the system, "connection.NAME".
     """
 
     def __init__(self, connections: SystemConnections, name: str) -> None:
         self._connections = connections
         self._lifeline = lifeline = Lifeline(connections, name)
         self._name = lifeline.name
-        self._views = ClientViews(lambda: not lifeline.is_closed, lifeline.is_open)
-        calls = _ClientCalls(lifeline, self._views)
-        self._client_loads = _ClientLoads(calls, self)
+        self._views = ConnectedViews(lambda: not lifeline.is_closed, lifeline.is_open)
+        calls = _ConnectedCalls(lifeline, self._views)
+        self._connected_loads = _ConnectedLoads(calls, self)
         self._unload_ways = RemoteUnloads(calls)
         weakref.finalize(self, lifeline.close)  # else the thread would keep it open for ever
-        listens = lifeline, weakref.ref(self._views), _loader(weakref.ref(self._client_loads))
+        listens = lifeline, weakref.ref(self._views), _loader(weakref.ref(self._connected_loads))
         threading.Thread(target=listen, args=listens, name="rr-statuses", daemon=True).start()
 
     @property
-    def _load_ways(self) -> _ClientLoads:
-        return self._client_loads
+    def _load_ways(self) -> _ConnectedLoads:
+        return self._connected_loads
 
     @property
     def name(self) -> str:
-        """The registrar's name in the system, "client.NAME"."""
+        """The registrar's name in the system, "connection.NAME"."""
         return self._name
 
     def _target(self, server: object, within_s: float | None = None) -> ServerId:
@@ -378,10 +379,10 @@ class ClientRegistrar(Consumer):
         return self, ""
 
     def _group(self, requests: Sequence[LoadWanted], parent: str, options: LoadOptions) -> GroupWays:
-        return RemoteGroup(self._client_loads, requests, parent, options)
+        return RemoteGroup(self._connected_loads, requests, parent, options)
 
     def _check_open(self) -> None:
-        """Do nothing: a call of a closed client raises NotRunning."""
+        """Do nothing: a call of a closed connection raises NotRunning."""
 
     def _may_block(self) -> bool:
         return True
@@ -393,7 +394,7 @@ class ClientRegistrar(Consumer):
         return given
 
     def ask(self, actor: str, message: Any, *, timeout_s: float | None = 30.0) -> Any:
-        """Ask an actor of the system as Client.ask() does. `rr.current().origin` of its handler is this registrar."""
+        """Ask an actor as Connection.ask() does. Its handler finds this registrar in `rr.current().origin`."""
         self._lifeline.check_here()
         return _asked(self._connections, actor, message, timeout_s, self._name)
 
@@ -421,8 +422,8 @@ class ClientRegistrar(Consumer):
             Unavailable: the registrar does not answer.
         """
         self._lifeline.check_here()
-        with self._connections.lent() as client:
-            found = client.queries(self.name)
+        with self._connections.lent() as socket:
+            found = socket.queries(self.name)
         if found.notes:
             raise Unavailable(f"{self.name}: its queries are not known: {'; '.join(found.notes)}")
         return found.rows
@@ -478,10 +479,10 @@ class ClientRegistrar(Consumer):
         self.close()
 
     def __repr__(self) -> str:
-        return f"<ClientRegistrar {self.name}>"
+        return f"<ConnectedRegistrar {self.name}>"
 
 
-def _loader(loads_of: Callable[[], _ClientLoads | None]) -> Callable[[], Load | None]:
+def _loader(loads_of: Callable[[], _ConnectedLoads | None]) -> Callable[[], Load | None]:
     def load() -> Load | None:
         loads = loads_of()
         return None if loads is None else loads.load_again
@@ -507,8 +508,8 @@ def _shown_types(_server_id: str) -> tuple[Codec, Codec]:
 
 def connect(
     state_dir: str | os.PathLike[str] | None = None, *, wait_s: float | None = 0.0, reconnect: bool = False
-) -> Client:
-    """Return a client of a running system of this user, in this process or another.
+) -> Connection:
+    """Return a connection to a running system of this user, in this process or another.
 
     Args:
         state_dir: the system's state directory; None: the one that RR_STATE names, or else of the one running system.
@@ -528,7 +529,7 @@ def connect(
     deadline = None if limit_s is None else time.monotonic() + limit_s
     while True:
         try:
-            return Client(find_console(None if place is None else state_path(place)), reconnect=reconnect)
+            return Connection(find_console(None if place is None else state_path(place)), reconnect=reconnect)
         except NotRunning:
             if deadline is not None and time.monotonic() >= deadline:
                 raise
@@ -565,11 +566,11 @@ def _too_late(server: str, timeout_s: float | None, why: str) -> LoadTimeout:
 def _encoded(value: Any, what: str) -> bytes:
     data = encode(value, what)
     if len(data) > VALUE_LIMIT_BYTES:
-        text = f"{what}: {len(data)} bytes is over a client's limit of {VALUE_LIMIT_BYTES}"
+        text = f"{what}: {len(data)} bytes is over a connection's limit of {VALUE_LIMIT_BYTES}"
         raise NotSerializable(f"{text}; give the name of a file, say", path=what, limit=VALUE_LIMIT_BYTES)
     return data
 
 
 def _refuse(name: str, option: str, is_used: bool) -> None:
     if is_used:
-        raise UsageError(f"registrar {name!r}: {option}: {NOT_FOR_CLIENTS[option]}")
+        raise UsageError(f"registrar {name!r}: {option}: {NOT_FOR_CONNECTIONS[option]}")

@@ -1,4 +1,4 @@
-"""Broken and hostile clients of the console: each is cut off or bounded, and neither the system nor another notices."""
+"""Broken and hostile programs at the console: each is cut off or bounded, and nobody else notices."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ import pytest
 import rr_actors as rr
 from rr_actors.base.errors import Unavailable
 from rr_actors.base.values.canonical import encode
-from rr_actors.system.console import console_client, console_server
-from rr_actors.system.console.console_client import ConsoleClient, find_console
+from rr_actors.system.console import console_connection, console_server
 from rr_actors.system.console.console_commands import Hold, Load
+from rr_actors.system.console.console_connection import ConsoleConnection, find_console
 from rr_actors.system.console.console_messages import (
     ANSWER_LIMIT_BYTES,
     REQUEST_LIMIT_BYTES,
@@ -73,9 +73,9 @@ def said_until_cut_off(peer: socket.socket) -> list[Any]:
 
 
 def assert_unharmed(state_dir: Path) -> None:
-    """Another client is answered at once."""
-    with ConsoleClient(find_console(state_dir), timeout_s=5.0) as client:
-        assert client.children().rows
+    """Another connection is answered at once."""
+    with ConsoleConnection(find_console(state_dir), timeout_s=5.0) as connection:
+        assert connection.children().rows
 
 
 def packed(value: object) -> bytes:
@@ -172,7 +172,7 @@ def test_a_hundred_silent_connections_harm_nobody_and_more_than_there_is_room_fo
 ) -> None:
     silent = [dialled() for _ in range(100)]
     assert_unharmed(state_dir)
-    monkeypatch.setattr(console_server, "CONNECTIONS_LIMIT", 100)
+    monkeypatch.setattr(console_server, "SOCKETS_LIMIT", 100)
 
     (refused,) = said_until_cut_off(dialled())
 
@@ -189,7 +189,7 @@ def _is_unharmed(state_dir: Path) -> bool:
     return True
 
 
-def test_a_client_that_asks_on_and_on_and_never_reads_has_one_answer_waiting_and_is_cut_off(
+def test_a_connection_that_asks_on_and_on_and_never_reads_has_one_answer_waiting_and_is_cut_off(
     system: rr.System, app: rr.Registrar, served: Served, dialled: Callable[[], socket.socket], state_dir: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
@@ -200,17 +200,17 @@ def test_a_client_that_asks_on_and_on_and_never_reads_has_one_answer_waiting_and
     peer.setblocking(False)
     request = framed(ListResources(), 1000)
     console = console_of(system)
-    eventually(lambda: console.connections and not console.clients[""])  # its Hello was read
-    (connection,) = console.connections
+    eventually(lambda: console.sockets and not console.programs[""])  # its Hello was read
+    (far_end,) = console.sockets
     with contextlib.suppress(ConnectionError):
         for _ in range(100_000):
             with contextlib.suppress(BlockingIOError):
                 peer.send(request)
-            if connection.is_gone:
+            if far_end.is_gone:
                 break
-            assert connection.unread_bytes < 2**20
+            assert far_end.unread_bytes < 2**20
 
-    eventually(lambda: connection.is_gone)
+    eventually(lambda: far_end.is_gone)
     assert_unharmed(state_dir)
 
 
@@ -259,14 +259,14 @@ def test_a_process_of_another_user_is_cut_off_without_a_word(
     assert said_until_cut_off(peer) == []
 
 
-def test_a_client_does_not_speak_to_another_users_system(
+def test_a_connection_does_not_speak_to_another_users_system(
     system: rr.System, state_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     place = find_console(state_dir)
-    monkeypatch.setattr(console_client, "peer_at", lambda connected: unix_sockets.SocketPeer(4711, 12345))
+    monkeypatch.setattr(console_connection, "peer_at", lambda connected: unix_sockets.SocketPeer(4711, 12345))
 
     with pytest.raises(Unavailable, match="got one of user 12345"):
-        ConsoleClient(place)
+        ConsoleConnection(place)
 
 
 @pytest.fixture
@@ -300,21 +300,21 @@ WAITS_FROM_BYTES = 64 * 1024  # as asyncio's transports have it
 
 
 def leave_unread(system: rr.System, app: rr.Registrar, peer: socket.socket) -> Any:
-    """Ask until an answer waits in the server, but not yet so much that the server waits; return its connection."""
+    """Ask until an answer waits in the server, but not yet so much that the server waits; return the server's end."""
     app.load_all([("provider/thing", "x" * 300 + str(number)) for number in range(30)])
     peer.sendall(HELLO)
     assert peer.recv(1000)
     console = console_of(system)
-    (connection,) = console.connections
-    with ConsoleClient(find_console(system.state_dir)) as client:
-        length = len(framed(client.ask(ListResources()), ANSWER_LIMIT_BYTES))
+    (far_end,) = console.sockets
+    with ConsoleConnection(find_console(system.state_dir)) as connection:
+        length = len(framed(connection.ask(ListResources()), ANSWER_LIMIT_BYTES))
     for number in range(1, 1000):
         peer.sendall(framed(ListResources(), 1000))
-        eventually(lambda number=number: _waiting(peer) + connection.unread_bytes == number * length)
-        if connection.unread_bytes:
+        eventually(lambda number=number: _waiting(peer) + far_end.unread_bytes == number * length)
+        if far_end.unread_bytes:
             break
-    assert connection.unread_bytes < WAITS_FROM_BYTES
-    return connection
+    assert far_end.unread_bytes < WAITS_FROM_BYTES
+    return far_end
 
 
 def _waiting(peer: socket.socket) -> int:
@@ -330,21 +330,21 @@ def send_no_more(peer: socket.socket) -> None:
 
 
 @pytest.mark.parametrize("how", [break_the_rules, send_no_more])
-def test_a_client_that_is_to_leave_and_does_not_read_is_cut_off(
+def test_a_connection_that_is_to_leave_and_does_not_read_is_cut_off(
     system: rr.System, app: rr.Registrar, served: Served, dialled: Callable[[], socket.socket],
     monkeypatch: pytest.MonkeyPatch, how: Callable[[socket.socket], None],
 ) -> None:  # fmt: skip
     monkeypatch.setattr(console_server, "STALLED_S", 0.3)
     peer = dialled()
-    connection = leave_unread(system, app, peer)
+    far_end = leave_unread(system, app, peer)
     console = console_of(system)
 
     how(peer)
 
-    eventually(lambda: connection not in console.connections)
+    eventually(lambda: far_end not in console.sockets)
 
 
-def test_a_client_that_leaves_with_requests_unread_is_noticed_while_its_first_one_is_carried_out(
+def test_a_connection_that_leaves_with_requests_unread_is_noticed_while_its_first_one_is_carried_out(
     system: rr.System, provider: rr.Registrar, gate: Gate, dialled: Callable[[], socket.socket],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
@@ -357,31 +357,31 @@ def test_a_client_that_leaves_with_requests_unread_is_noticed_while_its_first_on
 
     peer.close()
 
-    eventually(lambda: not console.connections, timeout=5.0)  # the gate is shut
+    eventually(lambda: not console.sockets, timeout=5.0)  # the gate is shut
     gate.open()
     eventually(lambda: not provider.resources())
 
 
-def test_a_load_that_its_client_cannot_hear_of_any_more_is_released_once(
+def test_a_load_that_its_connection_cannot_hear_of_any_more_is_released_once(
     system: rr.System, app: rr.Registrar, provider: rr.Registrar, served: Served, gate: Gate,
     dialled: Callable[[], socket.socket], caplog: pytest.LogCaptureFixture,
 ) -> None:  # fmt: skip
     slow = serve(provider, "slow", load=gate)
     console, peer = console_of(system), dialled()
     assert console is not None
-    connection = leave_unread(system, app, peer)
-    with rr.connect(system.state_dir) as client:
-        holder = client.open_registrar("worker")
+    far_end = leave_unread(system, app, peer)
+    with rr.connect(system.state_dir) as connection:
+        holder = connection.open_registrar("worker")
         peer.sendall(framed(Hold(holder.name, "provider/slow", encode("1")), 1000))
         gate.wait_arrived()
         send_no_more(peer)
-        eventually(lambda: connection.is_gone)
+        eventually(lambda: far_end.is_gone)
         gate.open()
         slow.unloads.wait(1)
 
         peer.close()
 
-        eventually(lambda: connection not in console.connections)
+        eventually(lambda: far_end not in console.sockets)
         eventually(lambda: holder.queries() == [])
-    eventually(lambda: not console.connections)
+    eventually(lambda: not console.sockets)
     assert "is not released" not in caplog.text

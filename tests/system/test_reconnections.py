@@ -1,4 +1,4 @@
-"""A client that reconnects holds after a restart of the system what it held before, or hears by name what is gone."""
+"""A connection that reconnects holds after a restart of the system what it held, or hears by name what is gone."""
 
 from __future__ import annotations
 
@@ -63,10 +63,10 @@ def place(state_dir: Path) -> Iterator[Place]:
 
 
 @pytest.fixture
-def client(place: Place) -> Iterator[rr.Client]:
+def connection(place: Place) -> Iterator[rr.Connection]:
     place.start(Cameras, Lamps)
-    with rr.connect(place.state_dir, reconnect=True) as client:
-        yield client
+    with rr.connect(place.state_dir, reconnect=True) as connection:
+        yield connection
 
 
 def told(calls: Calls, count: int) -> list[tuple[str, str]]:
@@ -75,10 +75,10 @@ def told(calls: Calls, count: int) -> list[tuple[str, str]]:
 
 
 def test_a_query_is_held_again_after_a_restart_with_its_callback_and_its_priority(
-    place: Place, client: rr.Client
+    place: Place, connection: rr.Connection
 ) -> None:
     heard = Calls()
-    worker = client.open_registrar("w")
+    worker = connection.open_registrar("w")
     query = worker.load("cameras/camera", "front", on_status=heard)
     query.priority = 5
     id, before = query.id, query.response
@@ -87,24 +87,28 @@ def test_a_query_is_held_again_after_a_restart_with_its_callback_and_its_priorit
 
     assert told(heard, 1) == [("ERROR", "ended")]
     assert (query.state, query.released) == (rr.State.ERROR, False)
-    for call in (lambda: worker.load("lamps/lamp", "a"), lambda: query.fetch_state(), lambda: client.ask("cameras", 1)):
-        with pytest.raises(rr.NotRunning, match="has ended: this client waits for its next run"):
+    for call in (
+        lambda: worker.load("lamps/lamp", "a"),
+        lambda: query.fetch_state(),
+        lambda: connection.ask("cameras", 1),
+    ):
+        with pytest.raises(rr.NotRunning, match="has ended: this connection waits for its next run"):
             call()
-    assert isinstance(client.ended, rr.NotRunning)
+    assert isinstance(connection.ended, rr.NotRunning)
     with pytest.raises(rr.NotRunning):
         next(query.stream("images"))
 
     system = place.start(Cameras, Lamps)
 
     assert told(heard, 2)[1] == ("OK", "reconnected")
-    assert (query.id, query.state, query.released, client.ended) == (id, rr.State.OK, False, None)
+    assert (query.id, query.state, query.released, connection.ended) == (id, rr.State.OK, False, None)
     assert query.response != before
     assert list(heard)[1].query is query
     assert query.fetch_state() == "OK"
     assert query.priority == 5
-    assert worker.ask("cameras", 1) == "client.w"
+    assert worker.ask("cameras", 1) == "connection.w"
     (info,) = system.registrar("cameras").resources()
-    assert (info.id, info.holders) == (query.resource_id, ("client.w",))
+    assert (info.id, info.holders) == (query.resource_id, ("connection.w",))
 
     system.registrar("cameras").send_status(info.id, rr.Status("WARNING", "dirty"))
     assert query.wait_status("WARNING", timeout_s=LIMIT_S).query_id == id
@@ -112,7 +116,9 @@ def test_a_query_is_held_again_after_a_restart_with_its_callback_and_its_priorit
     assert system.registrar("cameras").resources() == []
 
 
-def test_callbacks_of_queries_that_come_back_together_run_one_after_the_other(place: Place, client: rr.Client) -> None:
+def test_callbacks_of_queries_that_come_back_together_run_one_after_the_other(
+    place: Place, connection: rr.Connection
+) -> None:
     runs, overlaps, heard = threading.Lock(), Calls(), Calls()
 
     def on_status(status: rr.Status) -> None:
@@ -123,7 +129,7 @@ def test_callbacks_of_queries_that_come_back_together_run_one_after_the_other(pl
             overlaps(status)
         heard(status)
 
-    worker = client.open_registrar("w")
+    worker = connection.open_registrar("w")
     for name in ("a", "b", "c", "d"):
         worker.load("lamps/lamp", name, on_status=on_status)
     place.stop()
@@ -133,8 +139,8 @@ def test_callbacks_of_queries_that_come_back_together_run_one_after_the_other(pl
     assert not overlaps
 
 
-def test_what_the_next_run_does_not_have_is_lost_by_name(place: Place, client: rr.Client) -> None:
-    worker = client.open_registrar("w")
+def test_what_the_next_run_does_not_have_is_lost_by_name(place: Place, connection: rr.Connection) -> None:
+    worker = connection.open_registrar("w")
     gone, stays = Calls(), Calls()
     lamp = worker.load("lamps/lamp", "red", on_status=gone, timeout_s=0.5)
     camera = worker.load("cameras/camera", "front", on_status=stays)
@@ -151,8 +157,8 @@ def test_what_the_next_run_does_not_have_is_lost_by_name(place: Place, client: r
     camera.unload()
 
 
-def test_what_is_released_while_no_system_runs_is_not_loaded_again(place: Place, client: rr.Client) -> None:
-    worker = client.open_registrar("w")
+def test_what_is_released_while_no_system_runs_is_not_loaded_again(place: Place, connection: rr.Connection) -> None:
+    worker = connection.open_registrar("w")
     lamp = worker.load("lamps/lamp", "red")
     camera = worker.load("cameras/camera", "front")
 
@@ -165,8 +171,8 @@ def test_what_is_released_while_no_system_runs_is_not_loaded_again(place: Place,
     assert system.registrar("lamps").resources() == []
 
 
-def test_a_second_restart_is_like_the_first(place: Place, client: rr.Client) -> None:
-    camera = client.open_registrar("w").load("cameras/camera", "front")
+def test_a_second_restart_is_like_the_first(place: Place, connection: rr.Connection) -> None:
+    camera = connection.open_registrar("w").load("cameras/camera", "front")
     for _ in range(2):
         place.stop()
         eventually(lambda: camera.state is rr.State.ERROR)
@@ -174,16 +180,18 @@ def test_a_second_restart_is_like_the_first(place: Place, client: rr.Client) -> 
         eventually(lambda: camera.state is rr.State.OK)
     system = place.system
     assert system is not None
-    assert [info.holders for info in system.registrar("cameras").resources()] == [("client.w",)]
+    assert [info.holders for info in system.registrar("cameras").resources()] == [("connection.w",)]
 
 
-def test_a_client_that_is_closed_while_no_system_runs_waits_for_none(place: Place, client: rr.Client) -> None:
-    worker = client.open_registrar("w")
+def test_a_connection_that_is_closed_while_no_system_runs_waits_for_none(
+    place: Place, connection: rr.Connection
+) -> None:
+    worker = connection.open_registrar("w")
     camera = worker.load("cameras/camera", "front")
     place.stop()
     eventually(lambda: camera.state is rr.State.ERROR)
 
-    client.close()
+    connection.close()
     system = place.start(Cameras)
 
     with pytest.raises(rr.NotRunning):
@@ -224,8 +232,8 @@ def run(state_dir: Path) -> Iterator[Callable[[], int]]:
 def test_a_system_that_was_killed_is_waited_for_too(run: Callable[[], int], state_dir: Path) -> None:
     heard = Calls()
     killed = run()
-    with rr.connect(state_dir, reconnect=True) as client, client.open_registrar("w") as worker:
-        assert client.pid == killed
+    with rr.connect(state_dir, reconnect=True) as connection, connection.open_registrar("w") as worker:
+        assert connection.pid == killed
         lamp = worker.load("lamps/lamp", "red", on_status=heard)
 
         os.kill(killed, signal.SIGKILL)
@@ -233,5 +241,5 @@ def test_a_system_that_was_killed_is_waited_for_too(run: Callable[[], int], stat
         again = run()
 
         assert told(heard, 2)[1] == ("OK", "reconnected")
-        assert client.pid == again
+        assert connection.pid == again
         assert lamp.fetch_state() == "OK"

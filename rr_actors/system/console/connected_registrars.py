@@ -1,7 +1,7 @@
-"""Registrars of clients: opened in the application's process for another process, as long as that is connected.
+"""Registrars of connected programs: opened in the application's process, as long as the program is connected.
 
-Each belongs to one connection. The kernel closes the connection when the client ends, however it ends. Then the
-registrar is closed, and its queries are released. In the system it is called "client.NAME". The system's next start
+Each belongs to one socket. The kernel closes the socket when the program ends, however it ends. Then the
+registrar is closed, and its queries are released. In the system it is called "connection.NAME". The system's next start
 gives up those that a killed application left.
 """
 
@@ -16,7 +16,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from rr_actors.base.errors import NameTaken, RrError, UnknownQuery, UnknownRegistrar, shown
-from rr_actors.base.names import CLIENTS
+from rr_actors.base.names import CONNECTED
 from rr_actors.base.reporting.log import Log
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.model.rows import State
@@ -33,24 +33,24 @@ _CLOSED_S = 10.0  # so long a name may wait for the end of the registrar before
 
 
 class Caller(Protocol):
-    """The connection by which a request came. What a client opens lives as long.
+    """The socket by which a request came. What a connected program opens lives as long.
 
     Attributes:
-        client: what all connections of one client have in common.
-        pid: the id of the client's process.
+        program: what all sockets of one connection (rr.connect()) have in common.
+        pid: the id of the program's process.
     """
 
-    client: object
+    program: object
     pid: int
 
     @property
     def is_gone(self) -> bool:
-        """Whether the client has left. From any thread."""
+        """Whether the program has left. From any thread."""
         ...
 
 
-class ClientsRegistrar:
-    """The registrar of one client, and the statuses that the client has not heard yet. From any thread."""
+class OpenedRegistrar:
+    """A registrar of one connected program, and the statuses that the program has not heard yet. From any thread."""
 
     def __init__(self, owner: Caller, registrar: Registrar) -> None:
         self.owner = owner
@@ -61,7 +61,7 @@ class ClientsRegistrar:
         self._arrived: Callable[[], None] | None = None
 
     async def hear(self, status: Status) -> None:
-        """Keep a status until the client has it, as the callback of each of its loads: the next of the query waits."""
+        """Keep a status until the program has it, as the callback of each of its loads: the next of the query waits."""
         response, released = news(self.registrar, status.query_id)
         if status.state is not State.UPDATE or (response is not None and len(response) > RESPONSE_LIMIT_BYTES):
             response = None
@@ -73,7 +73,7 @@ class ClientsRegistrar:
             await taken.wait()
 
     def watch(self, query: Query, node: Node) -> None:
-        """Have the client hear when its query is released, also if it is not the client that releases it.
+        """Have the program hear when its query is released, also if it is not the program that releases it.
 
         If its provider takes the query away, its last status says so. If the system stops, the end of the connection
         does.
@@ -96,7 +96,7 @@ class ClientsRegistrar:
         return True
 
     def has_unheard(self, arrived: Callable[[], None]) -> bool:
-        """Return whether statuses wait for the client; if none does, have `arrived` called once when one arrives."""
+        """Return whether statuses wait for the program; if none does, have `arrived` called once when one arrives."""
         with self._lock:
             self._arrived = None if self._unheard else arrived
             return bool(self._unheard)
@@ -115,26 +115,26 @@ class ClientsRegistrar:
         return taken
 
     def end(self) -> None:
-        """Drop the statuses that wait, and all later ones, as the client has gone."""
+        """Drop the statuses that wait, and all later ones, as the program has gone."""
         with self._lock:
             self._ended = True
         while self.take():
             pass
 
 
-class ClientRegistrars:
-    """The clients' registrars of one system. In workers, except has_statuses()."""
+class ConnectedRegistrars:
+    """The registrars of the connected programs of one system. In workers, except has_statuses()."""
 
     def __init__(self) -> None:
         self._lock = threading.Condition()
-        self._open: dict[str, ClientsRegistrar] = {}
+        self._open: dict[str, OpenedRegistrar] = {}
         self._closing: set[str] = set()
 
     def open(self, owner: Caller, name: str, open: Callable[[str], Registrar]) -> None:
-        """Open a registrar for a connection, until that ends. One whose client has left is waited for.
+        """Open a registrar for a program, until that ends. One whose program has left is waited for.
 
         Raises:
-            NameTaken: another client has this name.
+            NameTaken: another connection has this name.
         """
         try:
             registrar = open(name)
@@ -143,31 +143,31 @@ class ClientRegistrars:
                 raise
             registrar = open(name)
         with self._lock:
-            self._open[name] = ClientsRegistrar(owner, registrar)
+            self._open[name] = OpenedRegistrar(owner, registrar)
 
     def _have_left(self, name: str) -> bool:
-        """Wait until the registrar of a client that has left is closed. Return False if its client is here."""
+        """Wait until the registrar of a program that has left is closed. Return False if its program is here."""
         with self._lock:
-            client = self._open.get(name)
-            if client is not None and not client.owner.is_gone:
+            opened = self._open.get(name)
+            if opened is not None and not opened.owner.is_gone:
                 return False
             return self._lock.wait_for(lambda: not (name in self._open or name in self._closing), _CLOSED_S)
 
     def close(self, owner: object) -> None:
-        """Close the registrars of a connection that has ended, and release what they hold."""
+        """Close the registrars of a program that has left, and release what they hold."""
         with self._lock:
-            mine = [name for name, client in self._open.items() if client.owner is owner]
+            mine = [name for name, opened in self._open.items() if opened.owner is owner]
             closing = [self._open.pop(name) for name in mine]
             self._closing.update(mine)
-        for client in closing:
-            client.end()
-            registrar = client.registrar
+        for opened in closing:
+            opened.end()
+            registrar = opened.registrar
             try:
                 registrar.close()
-                logger.info("registrar %s: closed, as its client has gone", registrar.name)
+                logger.info("registrar %s: closed, as its program has gone", registrar.name)
             except Exception:  # a provider's error, or a defect: go on with the others
                 logger.exception(
-                    "registrar %s: its client has gone, and not all that it held is released", registrar.name
+                    "registrar %s: its program has gone, and not all that it held is released", registrar.name
                 )
             finally:
                 with self._lock:
@@ -177,39 +177,39 @@ class ClientRegistrars:
     def has_statuses(self, registrar: str, owner: object, arrived: Callable[[], None]) -> bool:
         """Return whether AwaitStatuses has an answer; if not, have `arrived` called, from any thread, once it has."""
         with self._lock:
-            client = self._open.get(registrar)
-        return client is None or client.owner is not owner or client.has_unheard(arrived)
+            opened = self._open.get(registrar)
+        return opened is None or opened.owner is not owner or opened.has_unheard(arrived)
 
     def release_unheard(self, registrar: str, query_id: str) -> None:
-        """Release a query of a client that left before it kept the query."""
+        """Release a query of a program that left before it kept the query."""
         try:
             self.named(registrar).registrar.unload(query_id)
         except (UnknownQuery, UnknownRegistrar):
-            logger.debug("query %s: released by its client or with its registrar", query_id)
+            logger.debug("query %s: released by its program or with its registrar", query_id)
         except RrError:
-            logger.exception("query %s: its client has gone, and it is not released", query_id)
+            logger.exception("query %s: its program has gone, and it is not released", query_id)
 
     def asking(self, caller: Caller, name: str) -> str:
-        """Return the name by which a client asks: of a registrar that it has opened, or with "" that of its process.
+        """Return the name by which a program asks: of a registrar that it has opened, or with "" that of its process.
 
         Raises:
             UnknownRegistrar: it has not opened the registrar.
         """
         if not name:
-            return f"{CLIENTS}pid-{caller.pid}"
-        if self.named(name).owner.client != caller.client:
-            raise UnknownRegistrar(f"registrar {shown(name)}: another client has opened it", registrar=name)
+            return f"{CONNECTED}pid-{caller.pid}"
+        if self.named(name).owner.program != caller.program:
+            raise UnknownRegistrar(f"registrar {shown(name)}: another connection has opened it", registrar=name)
         return name
 
-    def named(self, name: str, owner: object = None) -> ClientsRegistrar:
-        """Return a client's registrar; with `owner`, only if this connection has opened it.
+    def named(self, name: str, owner: object = None) -> OpenedRegistrar:
+        """Return a program's registrar; with `owner`, only if this socket has opened it.
 
         Raises:
-            UnknownRegistrar: no client has opened it, or the client has gone.
+            UnknownRegistrar: no connection has opened it, or it has ended.
         """
         with self._lock:
-            client = self._open.get(name)
-        if client is None or owner not in (None, client.owner):
-            text = f"registrar {shown(name)}: no client has opened it, or its client has gone"
+            opened = self._open.get(name)
+        if opened is None or owner not in (None, opened.owner):
+            text = f"registrar {shown(name)}: no connection has opened it, or it has ended"
             raise UnknownRegistrar(text, registrar=name)
-        return client
+        return opened

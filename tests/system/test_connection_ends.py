@@ -1,4 +1,4 @@
-"""A client hears at once that a query of it is released, revoked, or gone with its system."""
+"""A connection hears at once that a query of it is released, revoked, or gone with its system."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.base.errors import UnknownQuery, UnknownRegistrar
 from rr_actors.registrar.queries import Status
-from rr_actors.system.console.client_queries import status_heard
+from rr_actors.system.console.connected_queries import status_heard
 from rr_actors.system.console.console_messages import Heard
 from support import LIMIT_S, Calls, eventually, kill, wait_respawned
 
@@ -42,9 +42,9 @@ def system(state_dir: Path) -> Iterator[rr.System]:
 
 
 @pytest.fixture
-def client(system: rr.System, state_dir: Path) -> Iterator[rr.Client]:
-    with rr.connect(state_dir) as client:
-        yield client
+def connection(system: rr.System, state_dir: Path) -> Iterator[rr.Connection]:
+    with rr.connect(state_dir) as connection:
+        yield connection
 
 
 class InThread:
@@ -82,9 +82,9 @@ def release_from_outside(system: rr.System, query: rr.Query[Any]) -> None:
 
 @pytest.mark.parametrize("read", [frames, lambda query: asyncio.run(frames_async(query))], ids=["for", "async for"])
 def test_a_stream_ends_when_the_query_is_released_from_outside(
-    system: rr.System, client: rr.Client, read: Callable[[rr.Query[Any]], Any]
+    system: rr.System, connection: rr.Connection, read: Callable[[rr.Query[Any]], Any]
 ) -> None:
-    query = client.open_registrar("w").load("cameras/camera", "front")
+    query = connection.open_registrar("w").load("cameras/camera", "front")
     reading = InThread(lambda: read(query))
 
     release_from_outside(system, query)
@@ -93,11 +93,11 @@ def test_a_stream_ends_when_the_query_is_released_from_outside(
 
 
 @pytest.mark.parametrize("read", [frames, lambda query: asyncio.run(frames_async(query))], ids=["for", "async for"])
-def test_a_resource_without_a_stream_says_so_to_a_client_at_once(
-    system: rr.System, client: rr.Client, read: Callable[[rr.Query[Any]], Any]
+def test_a_resource_without_a_stream_says_so_to_a_connection_at_once(
+    system: rr.System, connection: rr.Connection, read: Callable[[rr.Query[Any]], Any]
 ) -> None:
     system.start_child(rr.ChildSpec(Unused, id="things"))
-    query = client.open_registrar("w").load("things/thing", "one")
+    query = connection.open_registrar("w").load("things/thing", "one")
     began = time.monotonic()
 
     with pytest.raises(rr.NotFound, match=r"has no stream 'images'; there are: none"):
@@ -106,11 +106,11 @@ def test_a_resource_without_a_stream_says_so_to_a_client_at_once(
     assert time.monotonic() - began < 15
 
 
-def test_a_stream_of_a_manager_that_has_crashed_since_a_clients_load_is_waited_for(
-    system: rr.System, client: rr.Client
+def test_a_stream_of_a_manager_that_has_crashed_since_a_connections_load_is_waited_for(
+    system: rr.System, connection: rr.Connection
 ) -> None:
     system.start_child(rr.ChildSpec(Unused, id="things"))
-    worker = client.open_registrar("w")
+    worker = connection.open_registrar("w")
     before = worker.load("things/thing", "one")
     wait_respawned(system, "things", kill(system, "things"))
     later = worker.load("things/thing", "one")
@@ -122,8 +122,10 @@ def test_a_stream_of_a_manager_that_has_crashed_since_a_clients_load_is_waited_f
         next(reader)
 
 
-def test_a_wait_for_a_status_ends_when_the_query_is_released_from_outside(system: rr.System, client: rr.Client) -> None:
-    query = client.open_registrar("w").load("cameras/camera", "front")
+def test_a_wait_for_a_status_ends_when_the_query_is_released_from_outside(
+    system: rr.System, connection: rr.Connection
+) -> None:
+    query = connection.open_registrar("w").load("cameras/camera", "front")
     waiting = InThread(lambda: query.wait_status("FATAL", timeout_s=None))
 
     release_from_outside(system, query)
@@ -131,17 +133,19 @@ def test_a_wait_for_a_status_ends_when_the_query_is_released_from_outside(system
     assert isinstance(waiting.ended().error, UnknownQuery)
 
 
-def test_a_query_that_is_released_from_outside_can_be_left_like_any_other(system: rr.System, client: rr.Client) -> None:
-    with client.open_registrar("w").load("cameras/camera", "front") as query:
+def test_a_query_that_is_released_from_outside_can_be_left_like_any_other(
+    system: rr.System, connection: rr.Connection
+) -> None:
+    with connection.open_registrar("w").load("cameras/camera", "front") as query:
         release_from_outside(system, query)
         with pytest.raises(UnknownQuery):
             query.wait_status(timeout_s=LIMIT_S)
 
 
-def test_all_queries_end_when_the_registrar_of_a_client_is_emptied_from_outside(
-    system: rr.System, client: rr.Client
+def test_all_queries_end_when_the_registrar_of_a_connection_is_emptied_from_outside(
+    system: rr.System, connection: rr.Connection
 ) -> None:
-    worker = client.open_registrar("w")
+    worker = connection.open_registrar("w")
     queries = [worker.load("cameras/camera", name) for name in "abc"]
     waiting = [InThread(lambda one=one: one.wait_status(timeout_s=None)) for one in queries]
 
@@ -150,9 +154,9 @@ def test_all_queries_end_when_the_registrar_of_a_client_is_emptied_from_outside(
     assert all(isinstance(one.ended().error, UnknownQuery) for one in waiting)
 
 
-def test_a_revocation_has_its_reason_and_its_deadline(system: rr.System, client: rr.Client) -> None:
+def test_a_revocation_has_its_reason_and_its_deadline(system: rr.System, connection: rr.Connection) -> None:
     heard = Calls()
-    query = client.open_registrar("w").load("cameras/camera", "front", on_status=heard)
+    query = connection.open_registrar("w").load("cameras/camera", "front", on_status=heard)
     app: rr.Registrar = system.registrar("cameras")
 
     revoking = InThread(lambda: app.revoke(query.resource_id, "no power", grace_s=5))
@@ -163,7 +167,7 @@ def test_a_revocation_has_its_reason_and_its_deadline(system: rr.System, client:
     revoking.ended()
 
 
-def test_each_field_of_a_status_reaches_a_client() -> None:
+def test_each_field_of_a_status_reaches_a_connection() -> None:
     slots = {name for cls in Status.__mro__ for name in getattr(cls, "__slots__", ())}
     of_status = {name for name in slots if not name.startswith("_")}
     values = {
@@ -189,11 +193,11 @@ def ending(state_dir: Path) -> Iterator[rr.System]:
 
 def test_the_end_of_the_system_is_a_status_of_each_query(ending: rr.System, state_dir: Path) -> None:
     heard = Calls()
-    with rr.connect(state_dir) as client:
-        worker = client.open_registrar("w")
+    with rr.connect(state_dir) as connection:
+        worker = connection.open_registrar("w")
         query = worker.load("cameras/camera", "front", on_status=heard)
         worker.on_status("cameras/camera", heard)
-        assert client.ended is None
+        assert connection.ended is None
 
         ending.stop()
 
@@ -201,13 +205,13 @@ def test_the_end_of_the_system_is_a_status_of_each_query(ending: rr.System, stat
         assert {(one.state, one.reason, one.query_id) for one in heard} == {("FATAL", "ended", query.id)}
         assert all(str(state_dir) in one.message for one in heard)
         assert query.state is rr.State.FATAL
-        assert isinstance(client.ended, rr.NotRunning)
+        assert isinstance(connection.ended, rr.NotRunning)
 
 
 def test_the_end_is_heard_also_if_statuses_come_while_the_system_stops(ending: rr.System, state_dir: Path) -> None:
     heard = Calls()
-    with rr.connect(state_dir) as client:
-        query = client.open_registrar("w").load("cameras/camera", "front", on_status=heard)
+    with rr.connect(state_dir) as connection:
+        query = connection.open_registrar("w").load("cameras/camera", "front", on_status=heard)
         cameras = ending.registrar("cameras")
 
         def say() -> None:
@@ -236,8 +240,8 @@ def test_the_end_is_heard_also_if_statuses_come_while_the_system_stops(ending: r
 def test_whatever_waits_raises_that_the_system_has_ended(
     ending: rr.System, state_dir: Path, wait: Callable[[rr.Query[Any]], Any]
 ) -> None:
-    with rr.connect(state_dir) as client:
-        query = client.open_registrar("w").load("cameras/camera", "front")
+    with rr.connect(state_dir) as connection:
+        query = connection.open_registrar("w").load("cameras/camera", "front")
         waiting = InThread(lambda: wait(query))
 
         ending.stop()
@@ -248,18 +252,18 @@ def test_whatever_waits_raises_that_the_system_has_ended(
 
 
 def test_every_call_says_in_the_same_words_that_the_system_has_ended(ending: rr.System, state_dir: Path) -> None:
-    with rr.connect(state_dir) as client:
-        worker = client.open_registrar("w")
+    with rr.connect(state_dir) as connection:
+        worker = connection.open_registrar("w")
         query = worker.load("cameras/camera", "front")
         ending.stop()
         eventually(lambda: query.state is rr.State.FATAL)
 
         texts = set()
         for call in (
-            lambda: client.ask("cameras", 1),
+            lambda: connection.ask("cameras", 1),
             lambda: worker.load("cameras/camera", "back"),
             lambda: worker.queries(),
-            lambda: client.open_registrar("x"),
+            lambda: connection.open_registrar("x"),
             lambda: query.fetch_state(),
         ):
             with pytest.raises(rr.NotRunning) as caught:
@@ -269,22 +273,22 @@ def test_every_call_says_in_the_same_words_that_the_system_has_ended(ending: rr.
 
 
 def test_a_query_is_left_without_an_error_when_the_system_has_ended(ending: rr.System, state_dir: Path) -> None:
-    with rr.connect(state_dir) as client, client.open_registrar("w").load("cameras/camera", "front") as query:
+    with rr.connect(state_dir) as connection, connection.open_registrar("w").load("cameras/camera", "front") as query:
         ending.stop()
         eventually(lambda: query.state is rr.State.FATAL)
 
 
-def test_a_client_that_is_closed_first_hears_of_no_end(ending: rr.System, state_dir: Path) -> None:
+def test_a_connection_that_is_closed_first_hears_of_no_end(ending: rr.System, state_dir: Path) -> None:
     heard = Calls()
-    client = rr.connect(state_dir)
-    query = client.open_registrar("w").load("cameras/camera", "front", on_status=heard)
-    client.close()
+    connection = rr.connect(state_dir)
+    query = connection.open_registrar("w").load("cameras/camera", "front", on_status=heard)
+    connection.close()
     with pytest.raises(UnknownQuery):
         query.wait_status(timeout_s=LIMIT_S)
 
     ending.stop()
 
-    assert client.ended is None
+    assert connection.ended is None
     assert not heard
 
 
@@ -293,20 +297,22 @@ def test_a_connection_waits_for_a_system_that_is_being_started(state_dir: Path) 
         rr.connect(state_dir, wait_s=0.1)
     connecting = InThread(lambda: rr.connect(state_dir, wait_s=LIMIT_S))
 
-    with rr.System([], state_dir=state_dir) as system, connecting.ended().result as client:
-        assert client.pid
-        assert client.system == system.name
+    with rr.System([], state_dir=state_dir) as system, connecting.ended().result as connection:
+        assert connection.pid
+        assert connection.system == system.name
 
 
 # -- servers by the methods that declare them --------------------------------------------------------------------------
 
 
-def test_a_client_loads_by_the_method_that_declares_the_server(system: rr.System, client: rr.Client) -> None:
-    with client.open_registrar("w").load(Cameras.open_camera, "front") as query:
+def test_a_connection_loads_by_the_method_that_declares_the_server(
+    system: rr.System, connection: rr.Connection
+) -> None:
+    with connection.open_registrar("w").load(Cameras.open_camera, "front") as query:
         assert query.server_id == "cameras/camera"
         assert query.response == "front"
 
 
-def test_a_client_hears_that_no_child_has_the_class(client: rr.Client) -> None:
+def test_a_connection_hears_that_no_child_has_the_class(connection: rr.Connection) -> None:
     with pytest.raises(UnknownRegistrar, match="no child of this system is a"):
-        client.open_registrar("w").load(Unused.make, "lamp")
+        connection.open_registrar("w").load(Unused.make, "lamp")

@@ -1,4 +1,4 @@
-"""The console's client: plain and synchronous, for any program of the same user. No part of a system runs in it."""
+"""A connection to the console: plain and synchronous, for any program of the user. No part of a system runs in it."""
 
 from __future__ import annotations
 
@@ -50,14 +50,14 @@ _IDLE = 8  # connections that are kept for the next call
 _here: weakref.WeakSet[Connections] = weakref.WeakSet()
 
 
-class ConsoleClient:
+class ConsoleConnection:
     """A connection to the console of a running system. For one thread; as a context manager it is closed at the end.
 
     Args:
         run_dir: the directory of the console's socket, as find_console() returns it.
         timeout_s: seconds that an answer may take, and that a request may take to be sent.
         greeting_s: seconds within which the console has to answer at first.
-        client: the same for all connections of a client; "": this is its only one.
+        program: the same for all sockets of one rr.Connection; "": this is its only one.
 
     Attributes:
         welcome: the console's answer to Hello, which names the system.
@@ -71,7 +71,7 @@ class ConsoleClient:
     """
 
     def __init__(
-        self, run_dir: Path, *, timeout_s: float = 60.0, greeting_s: float = GREETING_S, client: str = ""
+        self, run_dir: Path, *, timeout_s: float = 60.0, greeting_s: float = GREETING_S, program: str = ""
     ) -> None:
         deadline = deadline_of(greeting_s)
         self.run_dir = run_dir
@@ -81,7 +81,7 @@ class ConsoleClient:
         self._answers: deque[c.Message] = deque()
         self.has_ended = self.is_broken = False
         try:
-            self.welcome = self._asked(c.Hello(c.VERSION, client), c.Welcome, deadline)
+            self.welcome = self._asked(c.Hello(c.VERSION, program), c.Welcome, deadline)
         except BaseException:
             self.close()
             raise
@@ -90,7 +90,7 @@ class ConsoleClient:
         """Send a question or a command, and return its answer.
 
         Args:
-            timeout_s: seconds until the answer has to be here; None: the client's own limit.
+            timeout_s: seconds until the answer has to be here; None: the connection's own limit.
 
         Raises:
             RrError: the system refused the request, or could not carry it out.
@@ -324,8 +324,8 @@ class Connections:
         self._name = os.urandom(8).hex()
         self._closed = ""
         self._lock = threading.Lock()
-        self._idle: list[ConsoleClient] = []
-        self._all: weakref.WeakSet[ConsoleClient] = weakref.WeakSet()
+        self._idle: list[ConsoleConnection] = []
+        self._all: weakref.WeakSet[ConsoleConnection] = weakref.WeakSet()
         _here.add(self)
 
     @property
@@ -338,7 +338,7 @@ class Connections:
         if self._closed:
             raise NotRunning(self._closed)
 
-    def open(self, greeting_s: float = GREETING_S) -> ConsoleClient:
+    def open(self, greeting_s: float = GREETING_S) -> ConsoleConnection:
         """Return a new connection. The caller closes it; close() does, too.
 
         Args:
@@ -349,16 +349,18 @@ class Connections:
             Unavailable: the system is another user's, or speaks another version.
         """
         self.check_open()
-        client = ConsoleClient(self._find(), timeout_s=self._timeout_s, greeting_s=greeting_s, client=self._name)
+        connection = ConsoleConnection(
+            self._find(), timeout_s=self._timeout_s, greeting_s=greeting_s, program=self._name
+        )
         with self._lock:
             if not self._closed:
-                self._all.add(client)
-                return client
-        client.close()
+                self._all.add(connection)
+                return connection
+        connection.close()
         raise NotRunning(self._closed)
 
     @contextmanager
-    def lent(self, greeting_s: float = GREETING_S) -> Generator[ConsoleClient]:
+    def lent(self, greeting_s: float = GREETING_S) -> Generator[ConsoleConnection]:
         """Lend a connection that no other call uses within the `with` block.
 
         Args:
@@ -369,9 +371,9 @@ class Connections:
         """
         with self._lock:
             kept = self._idle.pop() if self._idle else None
-        client = kept or self.open(greeting_s)
+        connection = kept or self.open(greeting_s)
         try:
-            yield client
+            yield connection
         except NotRunning:  # the system has ended, and the idle connections with it
             with self._lock:
                 idle, self._idle = self._idle, []
@@ -379,7 +381,7 @@ class Connections:
                 other.close()
             raise
         finally:
-            self._give_back(client)
+            self._give_back(connection)
 
     def ask(self, request: Verb[_A], timeout_s: float | None = None) -> _A:
         """Send a question or a command, and return its answer.
@@ -394,40 +396,40 @@ class Connections:
             Unavailable: no answer came in time; the system may carry out the request all the same.
         """
         deadline = deadline_of(self._timeout_s if timeout_s is None else timeout_s)
-        with self.lent(GREETING_S if timeout_s is None else min(GREETING_S, timeout_s)) as client:
-            return client.ask(request, left_until(deadline))
+        with self.lent(GREETING_S if timeout_s is None else min(GREETING_S, timeout_s)) as connection:
+            return connection.ask(request, left_until(deadline))
 
     def drop_ended(self) -> None:
         """Close the idle connections that the system has closed."""
         with self._lock:
-            ended = [client for client in self._idle if not client.is_open()]
-            self._idle = [client for client in self._idle if client not in ended]
-        for client in ended:
-            client.close()
+            ended = [connection for connection in self._idle if not connection.is_open()]
+            self._idle = [connection for connection in self._idle if connection not in ended]
+        for connection in ended:
+            connection.close()
 
     def close(self, why: str) -> None:
         """Close all connections. Calls in flight and later ones raise NotRunning. A second close does nothing."""
         with self._lock:
             self._closed = self._closed or why
-            clients, self._idle = list(self._all), []
-        for client in clients:
-            client.close()
+            connections, self._idle = list(self._all), []
+        for connection in connections:
+            connection.close()
 
     def leave_to_parent(self) -> None:
         """Close the copies in a forked child, so that the parent's connections end with the parent."""
         self._lock = threading.Lock()  # another thread may have held it at the fork
-        self._closed = "this process was forked from the client's: call rr.connect() here"
+        self._closed = "this process was forked from the one that connected: call rr.connect() here"
         self._idle = []
-        for client in list(self._all):
-            client.drop()
+        for connection in list(self._all):
+            connection.drop()
 
-    def _give_back(self, client: ConsoleClient) -> None:
+    def _give_back(self, connection: ConsoleConnection) -> None:
         with self._lock:
-            kept = not client.is_broken and not self._closed and len(self._idle) < _IDLE
+            kept = not connection.is_broken and not self._closed and len(self._idle) < _IDLE
             if kept:
-                self._idle.append(client)
+                self._idle.append(connection)
         if not kept:
-            client.close()
+            connection.close()
 
 
 def _forked() -> None:

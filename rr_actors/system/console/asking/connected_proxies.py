@@ -1,4 +1,4 @@
-"""ClientProxy: an actor of a running system, as a client calls its methods."""
+"""ConnectedProxy: an actor of a running system, as a connected program calls its methods."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from rr_actors.actors.messaging.futures import Reply, fail
 from rr_actors.base.values.canonical import Codec
 from rr_actors.system.console.asking.actor_calls import CallActor, given_bytes
-from rr_actors.system.console.client_queries import SystemConnections
+from rr_actors.system.console.connected_queries import SystemConnections
 from rr_actors.system.console.console_questions import ListMethods
 
 T = TypeVar("T")
@@ -23,7 +23,7 @@ _answer = Codec(None, "answer")
 
 def in_thread(reply: Reply[T], call: Callable[[], T]) -> None:
     """Have a new thread make a call, and set the reply. The application's executor may be full of other calls."""
-    threading.Thread(target=_make, args=(reply, call), name="rr-client", daemon=True).start()
+    threading.Thread(target=_make, args=(reply, call), name="rr-connection", daemon=True).start()
 
 
 def _make(reply: Reply[T], call: Callable[[], T]) -> None:
@@ -35,10 +35,10 @@ def _make(reply: Reply[T], call: Callable[[], T]) -> None:
         del reply  # the error has a traceback with this frame
 
 
-class ClientProxy:
-    """An actor of the system, by its id. Client.proxy() makes it::
+class ConnectedProxy:
+    """An actor of the system, by its id. Connection.proxy() makes it::
 
-        client.proxy("budgets").set_capacity("watts", 60).get()
+        connection.proxy("budgets").set_capacity("watts", 60).get()
 
     A call returns a future at once, as that of a proxy in the application does. Arguments and answers are plain data:
     an answer that is a dataclass comes as a dict. dir() has the methods of the actor.
@@ -74,4 +74,4 @@ class ClientProxy:
         return [row.name for row in self._connections.ask(ListMethods(self._actor), _LISTING_S).rows]
 
     def __repr__(self) -> str:
-        return f"<ClientProxy of {self._actor}>"
+        return f"<ConnectedProxy of {self._actor}>"
