@@ -312,6 +312,30 @@ def test_ctrl_c_leaves_the_terminal_as_it_was(tmux: Tmux) -> None:
     eventually(lambda: " icanon" in tmux("capture-pane", "-p"), 60.0)
 
 
+SLOW = """
+import pathlib, time
+pathlib.Path({began!r}).touch()
+while not pathlib.Path({ends!r}).exists():
+    time.sleep(0.01)
+"""
+
+
+@pytest.mark.timeout(120)
+@needs_tmux
+def test_a_save_during_the_first_check_is_checked_as_well(folder: Path, tmp_path: Path) -> None:
+    learner, file = LearnerFolder.open(folder), folder / FIRST.file_name
+    learner.step(FIRST).answer = next(iter(FIRST.question.answers))
+    learner.save()
+    began, ends = tmp_path / "began", tmp_path / "ends"
+    file.write_text(SLOW.format(began=str(began), ends=str(ends)))
+
+    with terminal(tmp_path, "learn", str(folder), columns=90, lines=60) as tmux:
+        eventually(began.exists, 60.0)
+        file.write_text(FIRST.solution)
+        ends.touch()
+        eventually(lambda: f"✓ {FIRST.file_name} is mended." in tmux("capture-pane", "-p"), 60.0)
+
+
 def test_a_save_is_seen_when_the_file_is_whole(tmp_path: Path) -> None:
     file = tmp_path / "one.py"
     file.write_text("a")
