@@ -7,7 +7,7 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -107,6 +107,19 @@ def test_a_file_that_cannot_be_checked_is_named_with_its_line(
     assert f"✗ {FIRST.file_name}: {what}" in ran.stdout
     assert f"where     {where}" in ran.stdout
     assert got in ran.stdout
+
+
+@pytest.mark.parametrize(
+    ("make", "got"), [(os.mkfifo, "a pipe, and no regular file"), (Path.mkdir, "Is a directory")], ids=["pipe", "dir"]
+)
+def test_what_is_no_file_is_named(make: Callable[[Path], None], got: str, folder: Path) -> None:
+    (folder / FIRST.file_name).unlink()
+    make(folder / FIRST.file_name)
+
+    ran = run_cli("learn", folder, "--check", FIRST.name)
+    assert ran.returncode == 1
+    assert f"✗ {FIRST.file_name}: the file cannot be read" in ran.stdout
+    assert f"got       {got}" in ran.stdout
 
 
 def test_a_syntax_error_shows_the_line_and_the_place(folder: Path) -> None:
