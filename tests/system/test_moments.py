@@ -48,12 +48,19 @@ def supervisor(event: str, path: str, state: str | None, **facts: Any) -> Entry:
     return child(event, path, state, kind="supervisor", **facts)
 
 
-RUNNING = [child("started", "root/a", "running", run=1), child("started", "root/b", "running", run=2)]
+RUNNING = [child("started", "root/a", "running", run=1), child("started", "root/b", "running", run=1)]
 NESTED = [
     child("started", "root/s/a", "running", run=1),
     supervisor("started", "root/s", "running", run=1),
-    child("started", "root/b", "running", run=2),
+    child("started", "root/b", "running", run=1),
 ]
+
+
+def first(path: str, at: float, ready_s: float = 0.5, kind: str = "manager") -> Entry:
+    return child("started", path, "running", at=at, kind=kind, run=1, ready_s=ready_s)
+
+
+TWO = [first("root/a", 1.0), first("root/b", 1.5)]
 
 COURSES: dict[str, tuple[list[Entry], dict[str, str]]] = {
     "nothing": ([], {}),
@@ -84,13 +91,35 @@ COURSES: dict[str, tuple[list[Entry], dict[str, str]]] = {
         {"root": "stopped", "root/a": "stopped", "root/b": "stopped"},
     ),
     "a system that was killed is followed by another": (
-        [*RUNNING, child("started", "root/b", "running", at=9.0, run=1, ready_s=1.0)],
+        [*TWO, first("root/b", 9.0)],
         {"root": "running", "root/b": "running"},
     ),
-    "a child of number 1 that is late takes no sibling with it": (
-        [child("started", "root/b", "running", at=8.5, run=2), child("started", "root/a", "running", at=9.0, run=1,
-                                                                      ready_s=1.0)],
+    "that ended": (
+        [*TWO, entry_of(Event.of({"event": "ended", "at": 5.0, "path": "root", "reason": "shutdown"})),
+         first("root/b", 9.0)],
+        {"root": "running", "root/b": "running"},
+    ),
+    "by a clock that was put back": ([*TWO, first("root/b", 0.9)], {"root": "running", "root/b": "running"}),
+    "which has another child, the first": (
+        [*TWO, first("root/c", 9.0), first("root/a", 9.6)],
+        {"root": "running", "root/c": "running", "root/a": "running"},
+    ),
+    "children start one after another": (
+        [*TWO, first("root/c", 3.0, 1.5)],
+        {"root": "running", "root/a": "running", "root/b": "running", "root/c": "running"},
+    ),
+    "a child is added later": (
+        [*TWO, first("root/c", 99.0)],
+        {"root": "running", "root/a": "running", "root/b": "running", "root/c": "running"},
+    ),
+    "a child is taken away, and added again": (
+        [*TWO, child("deleted", "root/b", None, at=9.0), first("root/b", 99.0)],
         {"root": "running", "root/a": "running", "root/b": "running"},
+    ),
+    "of an inner supervisor, too": (
+        [first("root/s/a", 1.0), first("root/s/b", 1.5), first("root/s", 1.5, 1.0, "supervisor"), first("root/c", 2.0),
+         first("root/s/a", 9.0), first("root/s", 9.0, 0.6, "supervisor"), first("root/c", 9.5)],
+        {"root": "running", "root/s": "running", "root/s/a": "running", "root/c": "running"},
     ),
     "a resource is loaded": ([resource("loaded")], {"x": "OK"}),
     "while its callback runs": ([load(), callback("began", "load")], {"x": "loading"}),
