@@ -229,7 +229,7 @@ def test_a_bridge_that_fails_goes_on_with_what_was_held(place: Place) -> None:
     place.world.call("/front_camera/hold", True)
     place.world.services.clear()
     place.system.ref("ros").tell("fail")
-    eventually(lambda: "/front_camera/hold" in place.world.services)
+    eventually(lambda: "/front_camera/hold" in place.world.services and place.world.hearers["/rr/renew"])
     assert nav.ask("load", **asked) == first
     assert place.world.latched["/front_camera/available"] is True
     assert place.world.call("/front_camera/hold", True)[0]
