@@ -28,7 +28,36 @@ _KINDS = (
     (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
 )
+_OF_PROCESSES = "/proc/"
 _AS_DIRECTORY = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+
+
+def may_block(path: Path) -> bool:
+    """Return whether to read this may wait for ever: a pipe, a socket or a device is in the place of a file."""
+    return path.exists() and not path.is_file() and not path.is_dir()
+
+
+def open_plain(path: str | os.PathLike[str]) -> io.BufferedReader:
+    """Open a file that a user names, to read it. To open a pipe would wait until somebody writes, perhaps for ever.
+
+    /dev/null is an empty file. A pipe that this process was given may be read: /dev/stdin, or the shell's /dev/fd/63.
+
+    Raises:
+        OSError: it cannot be opened; or it is a pipe, a socket or a device, and `strerror` says so.
+        ValueError: no file has such a name.
+    """
+    path = Path(path)
+    if may_block(path) and not path.samefile(os.devnull) and not str(path.resolve()).startswith(_OF_PROCESSES):
+        mode = path.stat().st_mode
+        kind = next(name for is_kind, name in _KINDS if is_kind(mode))
+        raise OSError(errno.EINVAL, f"{kind}, and no regular file", str(path))
+    return path.open("rb")
+
+
+def read_plain(path: str | os.PathLike[str]) -> bytes:
+    """Return the content of a file that open_plain() opens; raise what that raises."""
+    with open_plain(path) as file:
+        return file.read()
 
 
 def make_directories(path: str | os.PathLike[str], *, synced: bool = False) -> None:

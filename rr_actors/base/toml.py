@@ -14,13 +14,13 @@ import importlib
 import os
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, cast, get_args, get_origin
 
 import msgspec
 
 from rr_actors.base.checks import path_text
 from rr_actors.base.errors import ConfigError, InvalidSpec, did_you_mean, shortened, shown
+from rr_actors.base.folder import read_plain
 
 _T = TypeVar("_T")
 _INTEGERS = range(-(2**63), 2**63)  # the range that TOML requires of a reader
@@ -81,7 +81,7 @@ def read_toml(file: str) -> dict[str, Any]:
 def read_bytes(file: str) -> bytes:
     """Return the bytes of the TOML file at this path; raise ConfigError if it cannot be read."""
     try:
-        return Path(file).read_bytes()
+        return read_plain(file)
     except (OSError, ValueError) as error:  # ValueError: no file has such a name
         problem = getattr(error, "strerror", None) or str(error)
         raise ConfigError(

@@ -23,6 +23,7 @@ import msgspec
 from rr_actors.base import pickling
 from rr_actors.base.checks import path_text
 from rr_actors.base.errors import ConfigError, UsageError, shown, text_of
+from rr_actors.base.folder import open_plain
 from rr_actors.base.values.canonical import shown_plain
 from rr_actors.streams.stream import Stream, StreamFrame
 
@@ -178,7 +179,7 @@ class RecordedStream:
         """
         self.file = path = _path(file)
         try:
-            with path.open("rb") as opened:
+            with open_plain(path) as opened:
                 self._data: Any = mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ)
         except (OSError, ValueError) as error:  # an empty file has no pages
             raise _wrong(path, _WANTED, text_of(error)) from error

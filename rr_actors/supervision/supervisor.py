@@ -18,7 +18,7 @@ from rr_actors.actors.messaging.ask_cycles import INSTEAD, activity, check_end
 from rr_actors.actors.messaging.futures import fail
 from rr_actors.actors.messaging.mailbox import is_stop
 from rr_actors.actors.refs import ActorRef, local_of, ref_to
-from rr_actors.actors.remote.hub import urn_of_path
+from rr_actors.actors.remote.hub import hub, urn_of_path
 from rr_actors.base.checks import NoSupervisor, SupervisorCall, check_id, examined, invalid
 from rr_actors.base.errors import (
     ActorUnavailable,
@@ -93,7 +93,13 @@ class Child(NamedTuple):
         Raises:
             UsageError: the child shares its process with others (placement="thread").
         """
-        return self.ref.kill()
+        if self.ref.kill():
+            return True
+        path, pid = self.ref.path, self.pid
+        process = hub(path)
+        if path is None or pid is None or process is None:
+            return False
+        return process.kill_before_up(path, pid)
 
     @staticmethod
     def fails(

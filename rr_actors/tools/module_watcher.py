@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 from rr_actors.base.errors import NotFound, RrError
+from rr_actors.base.folder import read_plain
 from rr_actors.base.reporting.log import Log
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor
 from rr_actors.system.system import System
@@ -72,7 +73,7 @@ class ModuleWatcher:
             if not self._files[file].look():
                 continue
             try:
-                compile(file.read_bytes(), str(file), "exec")
+                compile(read_plain(file), str(file), "exec")
             except (OSError, SyntaxError, ValueError) as error:
                 logger.error("%s has changed, and cannot be loaded; its children run on: %s", file, error)
                 continue

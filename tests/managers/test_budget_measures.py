@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -220,13 +221,26 @@ def test_a_sink_that_cannot_be_is_refused_by_name(pool: Pool, key: str) -> None:
     assert caught.value.key == key
 
 
+def grid() -> float:
+    """Read one reading that a test has given. Each of the others is as the battery says."""
+    with contextlib.suppress(FileNotFoundError):
+        Path("once").rename("taken")
+        return float(Path("taken").read_text())
+    return battery()
+
+
+def put(name: str, reading: str) -> None:
+    """Write a file whole, beside a probe that reads it."""
+    Path("new").write_text(reading)
+    Path("new").rename(name)
+
+
 def test_while_there_is_too_much_sinks_are_loaded_one_after_another(
     start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    file = tmp_path / "battery"
-    file.write_text("50")
-    measure = msgspec.structs.replace(GRID, probe=battery, every_s=0.02)
+    put("battery", "50.3")  # between: nothing changes
+    measure = msgspec.structs.replace(GRID, probe=grid, every_s=0.02)
     sinks = tuple(Sink("house/sink", name, least_on_s=0.0) for name in ("boiler", "car"))
     budgets = rr.ChildSpec(Budgets, id="budgets", args=([Pool("hertz", 100, sink=sinks, measure=measure)],))
     system = start(rr.Supervisor([budgets], max_restarts=9))
@@ -243,17 +257,23 @@ def test_while_there_is_too_much_sinks_are_loaded_one_after_another(
     def problem() -> str:
         return proxy.pools().get()[0].problem
 
-    file.write_text("50.6")
+    put("once", "50.6")
+    steps.wait(1)
+    eventually(lambda: proxy.pools().get()[0].used == 30)
+    put("once", "50.6")
     steps.wait(2)
+    put("battery", "50.6")
     eventually(lambda: problem() == "there is too much: its probe reads 50.6, and no sink is left")
     assert [info.priority for info in house.resources()] == [-1000, -1000]
     assert proxy.pools().get()[0].used == 60
-    file.write_text("50.3")  # between: nothing changes
+    put("battery", "50.3")
     eventually(lambda: problem() == "")
     wait_respawned(system, "budgets", kill(system, "budgets"))
     assert eventually(lambda: proxy.pools().get()[0].used == 60)
     assert [len(info.queries) for info in house.resources()] == [1, 1]
-    file.write_text("50.1")
+    put("once", "50.1")
+    steps.wait(3)
+    put("once", "50.1")
     steps.wait(4)
     assert steps.items == ["on boiler", "on car", "off car", "off boiler"]
 

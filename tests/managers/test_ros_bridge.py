@@ -187,10 +187,9 @@ def test_what_a_node_does_not_renew_is_released_and_it_hears_that(place: Place) 
 
 
 def test_an_owner_that_never_was_is_refused(place: Place) -> None:
-    nav = Node(place.world, "nav")
-    nav.send("load", id="1", server="cameras/camera", request=DEVICE, owner="/ghost")
-    heard = list[str]()
+    nav, heard = Node(place.world, "nav"), list[str]()
     nav.graph.hear("/rr/answers", heard.append)
+    nav.send("load", id="1", server="cameras/camera", request=DEVICE, owner="/ghost")
     eventually(lambda: heard)
     assert '"path":"owner"' in heard[0]
     assert (place.opened, place.held()) == ([], 0)
@@ -230,7 +229,7 @@ def test_a_bridge_that_fails_goes_on_with_what_was_held(place: Place) -> None:
     place.world.call("/front_camera/hold", True)
     place.world.services.clear()
     place.system.ref("ros").tell("fail")
-    eventually(lambda: "/front_camera/hold" in place.world.services)
+    eventually(lambda: "/front_camera/hold" in place.world.services and place.world.hearers["/rr/renew"])
     assert nav.ask("load", **asked) == first
     assert place.world.latched["/front_camera/available"] is True
     assert place.world.call("/front_camera/hold", True)[0]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
 
 import rr_actors as rr
-from support import LIMIT_S, eventually
+from rr_actors.actors.remote.hub import hub
+from support import LIMIT_S, eventually, wait_gone
 
 
 class Lamps(rr.Manager):
@@ -28,6 +30,24 @@ def test_a_killed_child_is_started_again_and_has_the_pid_of_the_process_that_ans
             assert after is not None
             assert after != before.pid
             eventually(lambda: here.which_child("lamps").state == "running")
+
+
+def test_a_child_that_has_a_pid_is_killed_though_its_supervisor_has_not_noted_the_start(state_dir: Path) -> None:
+    children = rr.Supervisor([rr.ChildSpec(Lamps, id="lamps")], id="root", max_restarts=100)
+    with rr.System(children, state_dir=state_dir) as system:
+        here, before = system.supervisor(), 0
+        for _ in range(10):
+            (listed,) = eventually(lambda pid=before: [one for one in here.which_children() if (one.pid or pid) != pid])
+            assert listed.kill()
+            before = listed.pid or 0
+            wait_gone(before)
+
+
+def test_the_process_of_a_child_that_shares_it_is_no_process_of_its_own(state_dir: Path) -> None:
+    with rr.System([rr.ChildSpec(Lamps, id="lamps", placement="thread")], state_dir=state_dir):
+        process = hub("root/lamps")
+        assert process is not None
+        assert not process.kill_before_up("root/lamps", os.getpid())
 
 
 def test_a_child_that_does_not_run_is_not_killed(state_dir: Path) -> None:

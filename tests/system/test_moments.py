@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from rr_actors.base.errors import ConfigError, UsageError
-from rr_actors.registrar.model.recorded import Entry
+from rr_actors.registrar.model.recorded import Entry, in_order
 from rr_actors.system.recording.event_memory import Event
 from rr_actors.system.recording.recordings import Recording, add, entry_of
 from rr_actors.system.rewound.moments import Moment, differences, first_moment, moment_after
@@ -48,12 +48,19 @@ def supervisor(event: str, path: str, state: str | None, **facts: Any) -> Entry:
     return child(event, path, state, kind="supervisor", **facts)
 
 
-RUNNING = [child("started", "root/a", "running", run=1), child("started", "root/b", "running", run=2)]
+RUNNING = [child("started", "root/a", "running", run=1), child("started", "root/b", "running", run=1)]
 NESTED = [
     child("started", "root/s/a", "running", run=1),
     supervisor("started", "root/s", "running", run=1),
-    child("started", "root/b", "running", run=2),
+    child("started", "root/b", "running", run=1),
 ]
+
+
+def first(path: str, at: float, ready_s: float = 0.5, kind: str = "manager") -> Entry:
+    return child("started", path, "running", at=at, kind=kind, run=1, ready_s=ready_s)
+
+
+TWO = [first("root/a", 1.0), first("root/b", 1.5)]
 
 COURSES: dict[str, tuple[list[Entry], dict[str, str]]] = {
     "nothing": ([], {}),
@@ -84,13 +91,35 @@ COURSES: dict[str, tuple[list[Entry], dict[str, str]]] = {
         {"root": "stopped", "root/a": "stopped", "root/b": "stopped"},
     ),
     "a system that was killed is followed by another": (
-        [*RUNNING, child("started", "root/b", "running", at=9.0, run=1, ready_s=1.0)],
+        [*TWO, first("root/b", 9.0)],
         {"root": "running", "root/b": "running"},
     ),
-    "a child of number 1 that is late takes no sibling with it": (
-        [child("started", "root/b", "running", at=8.5, run=2), child("started", "root/a", "running", at=9.0, run=1,
-                                                                      ready_s=1.0)],
+    "that ended": (
+        [*TWO, entry_of(Event.of({"event": "ended", "at": 5.0, "path": "root", "reason": "shutdown"})),
+         first("root/b", 9.0)],
+        {"root": "running", "root/b": "running"},
+    ),
+    "by a clock that was put back": ([*TWO, first("root/b", 0.9)], {"root": "running", "root/b": "running"}),
+    "which has another child, the first": (
+        [*TWO, first("root/c", 9.0), first("root/a", 9.6)],
+        {"root": "running", "root/c": "running", "root/a": "running"},
+    ),
+    "children start one after another": (
+        [*TWO, first("root/c", 3.0, 1.5)],
+        {"root": "running", "root/a": "running", "root/b": "running", "root/c": "running"},
+    ),
+    "a child is added later": (
+        [*TWO, first("root/c", 99.0)],
+        {"root": "running", "root/a": "running", "root/b": "running", "root/c": "running"},
+    ),
+    "a child is taken away, and added again": (
+        [*TWO, child("deleted", "root/b", None, at=9.0), first("root/b", 99.0)],
         {"root": "running", "root/a": "running", "root/b": "running"},
+    ),
+    "of an inner supervisor, too": (
+        [first("root/s/a", 1.0), first("root/s/b", 1.5), first("root/s", 1.5, 1.0, "supervisor"), first("root/c", 2.0),
+         first("root/s/a", 9.0), first("root/s", 9.0, 0.6, "supervisor"), first("root/c", 9.5)],
+        {"root": "running", "root/s": "running", "root/s/a": "running", "root/c": "running"},
     ),
     "a resource is loaded": ([resource("loaded")], {"x": "OK"}),
     "while its callback runs": ([load(), callback("began", "load")], {"x": "loading"}),
@@ -253,6 +282,66 @@ def test_many_entries_are_folded_from_the_moment_kept_before() -> None:
     for number in (0, 1, 199, 200, 201, 2999, 3000):
         first = first_moment(plain, [], 1.0)
         assert rewound.moment(number).resources == moment_after(first, plain[:number]).resources
+
+
+# -- the clock ---------------------------------------------------------------------------------------------------------
+
+
+def arrived(entries: list[Entry]) -> list[Entry]:
+    """The entries, with their numbers in a recording."""
+    return [replace(entry, seq=number) for number, entry in enumerate(entries, 1)]
+
+
+def lens_ends(put_back_s: float) -> Recording:
+    """A recording in which the clock is put back between a death and the next start. Callbacks arrive late."""
+    started = child("started", "root/cameras", "running", at=100.0, run=1)
+    began = replace(callback("began", "load"), at=101.0, process="root/cameras", pid=7)
+    died = child("exited", "root/cameras", "restarting", at=103.0, reason="killed")
+    again = child("restarted", "root/cameras", "running", at=103.5 - put_back_s, run=2)
+    unloads = replace(callback("began", "unload"), at=104.0 - put_back_s, process="root/cameras", pid=8)
+    unloaded = resource("unloaded", at=104.1 - put_back_s)
+    recording = Recording("robot")
+    add(recording, arrived([started, resource("loaded", at=101.1), began, died, again, unloaded, unloads]))
+    return recording
+
+
+@pytest.mark.parametrize("put_back_s", [0.0, 1.0, 3600.0])
+def test_a_clock_that_is_put_back_changes_no_order(put_back_s: float, tmp_path: Path) -> None:
+    recording = lens_ends(put_back_s)
+    recording.save(tmp_path / "clock.jsonl")
+
+    for rewound in (rewind(recording), rewind(tmp_path / "clock.jsonl")):
+        assert [step.entry.event for step in rewound.steps] == [
+            *("started", "began", "loaded", "exited", "restarted", "began", "unloaded")
+        ]
+        assert states(rewound.moment(len(rewound))) == {"root": "running", "root/cameras": "running"}
+        assert rewound.number_at(rewound.until) == len(rewound)
+    events = [entry.event for entry in recording.trace("x").entries]
+    assert events == ["began", "loaded", "exited", "restarted", "began", "unloaded"]
+
+
+@given(
+    st.lists(st.tuples(st.floats(0.001, 5.0), st.integers(0, 2), st.floats(0.0, 0.2)), max_size=20),
+    st.integers(0, 20),
+    st.floats(20.0, 1e6),
+)
+def test_entries_are_in_the_order_in_which_they_happened(
+    happened: list[tuple[float, int, float]], jump: int, put_back_s: float
+) -> None:
+    """Three processes send what happened a little later, each in its order; the clock is put back once, or never."""
+    now, entries, sent = 1000.0, list[tuple[float, Entry]](), [0.0, 0.0, 0.0]
+    for number, (after_s, source, late_s) in enumerate(happened):
+        now += after_s + (1.0 if number == jump else 0.0)  # what is late has come when the clock is put back
+        sent[source] = max(sent[source], now + late_s)
+        at = now - (put_back_s if number >= jump else 0.0)
+        entries.append((sent[source], Entry(at, "began", process=f"root/{source}", detail=f"{number:02}")))
+    found = in_order(arrived([entry for _, entry in sorted(entries, key=lambda one: one[0])]))
+
+    for source in range(3):
+        of_one = [entry.detail for entry in found if entry.process == f"root/{source}"]
+        assert of_one == sorted(of_one)
+    if jump >= len(happened):
+        assert [entry.detail for entry in found] == [f"{number:02}" for number in range(len(happened))]
 
 
 # -- questions ---------------------------------------------------------------------------------------------------------

@@ -122,6 +122,21 @@ def test_a_state_directory_tells_the_lives_of_children_also_after_the_end(
     assert rewind(state_dir / "history.jsonl").moment(2).children == rewound.moment(2).children
 
 
+def test_a_child_that_starts_takes_none_of_the_others_away(start: Start, workshop: Workshop, state_dir: Path) -> None:
+    specs = [rr.ChildSpec(Shop, id=id, args=(str(workshop.root),), placement="thread") for id in ("a", "b", "c")]
+    system = start(*specs[:2])
+    with system.record() as recording:
+        system.supervisor().start_child(specs[2])
+        eventually(lambda: last(recording) == told_live(state_dir), what="the recording says what the console says")
+
+    rewound = rewind(state_dir)
+    assert ["".join(sorted(id[5:] for id in rewound.moment(number).children)) for number in (1, 2, 3)] == [
+        "a",
+        "ab",
+        "abc",
+    ]
+
+
 def test_a_damaged_recording_says_what_can_still_be_read(shops: rr.System, tmp_path: Path) -> None:
     file = tmp_path / "whole.jsonl"
     with shops.record(file):

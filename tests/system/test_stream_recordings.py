@@ -171,6 +171,13 @@ def test_a_file_that_is_cut_anywhere_has_the_whole_frames_before(tmp_path: Path)
     assert counts[-2:] == [2, 3]
 
 
+def test_a_pipe_is_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+
+    with pytest.raises(rr.ConfigError, match=r"pipe: expected the file of a recorded stream, got .*a pipe, and no reg"):
+        rr.read_stream(tmp_path / "pipe")
+
+
 def test_a_file_that_is_damaged_ends_at_the_damage_or_is_refused(tmp_path: Path) -> None:
     data = bytearray(write(tmp_path / "f", *range(20)).read_bytes())
     whole = len(rr.read_stream(tmp_path / "f"))

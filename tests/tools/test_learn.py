@@ -7,7 +7,7 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -107,6 +107,19 @@ def test_a_file_that_cannot_be_checked_is_named_with_its_line(
     assert f"✗ {FIRST.file_name}: {what}" in ran.stdout
     assert f"where     {where}" in ran.stdout
     assert got in ran.stdout
+
+
+@pytest.mark.parametrize(
+    ("make", "got"), [(os.mkfifo, "a pipe, and no regular file"), (Path.mkdir, "Is a directory")], ids=["pipe", "dir"]
+)
+def test_what_is_no_file_is_named(make: Callable[[Path], None], got: str, folder: Path) -> None:
+    (folder / FIRST.file_name).unlink()
+    make(folder / FIRST.file_name)
+
+    ran = run_cli("learn", folder, "--check", FIRST.name)
+    assert ran.returncode == 1
+    assert f"✗ {FIRST.file_name}: the file cannot be read" in ran.stdout
+    assert f"got       {got}" in ran.stdout
 
 
 def test_a_syntax_error_shows_the_line_and_the_place(folder: Path) -> None:
@@ -310,6 +323,30 @@ def test_ctrl_c_leaves_the_terminal_as_it_was(tmux: Tmux) -> None:
     eventually(lambda: "Press 1 to 3" in tmux("capture-pane", "-p"), 60.0)
     tmux("send-keys", "C-c")
     eventually(lambda: " icanon" in tmux("capture-pane", "-p"), 60.0)
+
+
+SLOW = """
+import pathlib, time
+pathlib.Path({began!r}).touch()
+while not pathlib.Path({ends!r}).exists():
+    time.sleep(0.01)
+"""
+
+
+@pytest.mark.timeout(120)
+@needs_tmux
+def test_a_save_during_the_first_check_is_checked_as_well(folder: Path, tmp_path: Path) -> None:
+    learner, file = LearnerFolder.open(folder), folder / FIRST.file_name
+    learner.step(FIRST).answer = next(iter(FIRST.question.answers))
+    learner.save()
+    began, ends = tmp_path / "began", tmp_path / "ends"
+    file.write_text(SLOW.format(began=str(began), ends=str(ends)))
+
+    with terminal(tmp_path, "learn", str(folder), columns=90, lines=60) as tmux:
+        eventually(began.exists, 60.0)
+        file.write_text(FIRST.solution)
+        ends.touch()
+        eventually(lambda: f"✓ {FIRST.file_name} is mended." in tmux("capture-pane", "-p"), 60.0)
 
 
 def test_a_save_is_seen_when_the_file_is_whole(tmp_path: Path) -> None:

@@ -16,8 +16,10 @@ from rr_actors.system.recording.recordings import Recording, add, entry_of
 from rr_actors.system.rewound.rewinding import rewind
 from rr_actors.tools.terminal.rewind_screen import RewindKeys, RewindScreen
 from rr_actors.tools.terminal.terminal_pane import Pane
-from support import LIMIT_S, eventually
+from support import eventually
 from support_tmux import Tmux, needs_tmux, terminal
+
+LIMIT_S = 30.0
 
 NOON = time.mktime((2026, 11, 30, 12, 0, 0, 0, 0, -1))
 
@@ -65,14 +67,21 @@ class Person:
         await self.press(*("space" if char == " " else char for char in text), "enter")
 
     async def sees(self, *texts: str, gone: str = "") -> None:
+        def shows() -> bool:
+            seen = self.all_shown()
+            return all(text in seen for text in texts) and not (gone and gone in seen)
+
+        await self.finds(shows, f"{texts}, without {gone!r}")
+
+    async def finds(self, predicate: Callable[[], bool], what: str = "") -> None:
         deadline = time.monotonic() + LIMIT_S
-        while True:
-            panes = (self.screen.left, self.screen.right, self.screen.steps)
-            seen = "\n---\n".join([*map(self.shown, panes), self.screen.status])
-            if all(text in seen for text in texts) and not (gone and gone in seen):
-                return
-            assert time.monotonic() < deadline, f"{texts} not in\n{seen}"
+        while not predicate():
+            assert time.monotonic() < deadline, f"expected {what or predicate}, got\n{self.all_shown()}"
             await self._pilot.pause(0.02)
+
+    def all_shown(self) -> str:
+        panes = (self.screen.left, self.screen.right, self.screen.steps)
+        return "\n---\n".join([*map(self.shown, panes), self.screen.status])
 
 
 def sit_down(recording: Recording, scene: Callable[[Person], Awaitable[None]]) -> None:
@@ -152,9 +161,9 @@ def test_a_mark_shows_what_is_different_from_it(recording: Recording) -> None:
 def test_a_question_mark_shows_the_keys(recording: Recording) -> None:
     async def scene(person: Person) -> None:
         await person.press("question_mark")
-        assert isinstance(person.screen.screen, RewindKeys)
+        await person.finds(lambda: isinstance(person.screen.screen, RewindKeys))
         await person.press("q")
-        assert not isinstance(person.screen.screen, RewindKeys)
+        await person.finds(lambda: not isinstance(person.screen.screen, RewindKeys))
 
     sit_down(recording, scene)
 
@@ -178,9 +187,12 @@ def tmux(recording: Recording, tmp_path: Path) -> Iterator[Tmux]:
 
 @needs_tmux
 def test_it_runs_in_a_real_terminal(tmux: Tmux) -> None:
-    eventually(lambda: "restarted" in tmux("capture-pane", "-p"), timeout=30.0)
+    def shows(*texts: str) -> bool:
+        screen = tmux("capture-pane", "-p")
+        return all(text in screen for text in texts)
+
+    eventually(lambda: shows("restarted"), LIMIT_S)
     tmux("send-keys", "Left", "Left")
-    eventually(lambda: "step 4 of 6" in tmux("capture-pane", "-p"), timeout=30.0)
-    assert "SIGKILL" in tmux("capture-pane", "-p")
+    eventually(lambda: shows("step 4 of 6", "SIGKILL"), LIMIT_S)
     tmux("send-keys", "q")
-    eventually(lambda: "exit code 0" in tmux("capture-pane", "-p"), timeout=30.0)
+    eventually(lambda: shows("exit code 0"), LIMIT_S)

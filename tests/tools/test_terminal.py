@@ -392,7 +392,7 @@ def test_what_is_typed_filters_the_pane(shop: rr.System, state_dir: Path) -> Non
     async def scene(person: Person) -> None:
         await person.chooses("root")
         await person.press("slash", "a", "p", "p")
-        await person.sees(lambda: person.tree.split()[0] == "@app")
+        await person.sees(lambda: person.tree.split()[:1] == ["@app"])
         await person.press("escape")
         await person.sees(lambda: "root" in person.tree)
         await person.chooses("@shop")

@@ -329,6 +329,22 @@ class ActorHub:
             return False
         return lifeline.signal_if(pid, signal.SIGKILL, lambda: self.pid(where) == pid)
 
+    def kill_before_up(self, path: str, pid: int) -> bool:
+        """Kill the process of a manager whose registrar is up, and who is not yet; return False if that is not so.
+
+        Args:
+            pid: the process that its supervisor has listed.
+        """
+        above = self._directory.actor(path.rpartition("/")[0])
+
+        def is_meant() -> bool:
+            entry = self._directory.lookup(registrar_key(path.rpartition("/")[2]))
+            if entry is None or entry.status is not Presence.UP or pid_of(entry.address) != pid:
+                return False
+            return above is not None and above.address != entry.address  # else the process is its supervisor's
+
+        return lifeline.signal_if(pid, signal.SIGKILL, is_meant)
+
     def _has_own_process(self, path: str) -> bool:
         mine = self._directory.actor(path)
         above = self._directory.actor(path.rpartition("/")[0])

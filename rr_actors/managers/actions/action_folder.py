@@ -19,11 +19,11 @@ import msgspec
 
 from rr_actors.base import pickling
 from rr_actors.base.errors import ConfigError, UsageError, text_of
+from rr_actors.base.folder import may_block
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.toml import wrong
 from rr_actors.managers.actions.action import Action, check_isolation, name_of, signature_of_class
 from rr_actors.managers.planning.kept_record import KeptRecord
-from rr_actors.managers.planning.last_good import may_block
 from rr_actors.registrar.manager import Beginning
 
 logger = Log("rr_actors.managers.actions")

@@ -15,6 +15,7 @@ from typing import Any, TypeVar, cast
 import msgspec
 
 from rr_actors.base.errors import did_you_mean
+from rr_actors.base.folder import read_plain
 from rr_actors.managers.actions.graph_model import (
     DEFAULT_CONDITIONS,
     RESPONSES,
@@ -80,7 +81,7 @@ def read_graph_file(path: str | os.PathLike[str]) -> ActionGraph:
 def read_graph_bytes(file: str) -> bytes:
     """Return the contents of a file with a graph; raise GraphError if it cannot be read."""
     try:
-        return Path(file).read_bytes()
+        return read_plain(file)
     except (OSError, ValueError) as error:  # ValueError: no file has such a name
         said = getattr(error, "strerror", None) or str(error)
         raise wrong_graph(file, "", "a file that can be read", said, said) from error

@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import Any, cast
 
 from rr_actors.base.errors import ConfigError, GraphError, UsageError, is_a, shown, text_of
+from rr_actors.base.folder import may_block
 from rr_actors.managers.actions.action import Action, check_isolation, name_of, signature_of_class
 from rr_actors.managers.actions.action_folder import ActionFolder, Kinds
 from rr_actors.managers.actions.graph_checks import Signature, completed, signature_of
 from rr_actors.managers.actions.graph_documents import parse_graph, read_graph, read_graph_bytes
 from rr_actors.managers.actions.graph_model import ActionGraph, wrong_graph
-from rr_actors.managers.planning.last_good import LastGood, Sources, may_block, path_of
+from rr_actors.managers.planning.last_good import LastGood, Sources, path_of
 from rr_actors.registrar.manager import Beginning
 
 

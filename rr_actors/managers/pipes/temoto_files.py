@@ -15,6 +15,7 @@ import msgspec
 import yaml
 
 from rr_actors.base.errors import ConfigError, shown
+from rr_actors.base.folder import read_plain
 from rr_actors.base.toml import convert_typed, wrong
 from rr_actors.managers.pipes.pipe_files import TYPE_EXPECTED, SegmentDescription, check_ends, is_type
 from rr_actors.managers.templates import Parameter, plain
@@ -83,7 +84,7 @@ def import_temoto(files: Sequence[Path]) -> str:
 def _read(path: Path) -> dict[str, Any]:
     file = str(path)
     try:
-        content: object = yaml.safe_load(path.read_bytes())
+        content: object = yaml.safe_load(read_plain(path))
     except OSError as error:
         raise _unread(file, "cannot be read", error.strerror or str(error), "a YAML file") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:

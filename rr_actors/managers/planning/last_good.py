@@ -17,6 +17,7 @@ import msgspec
 
 from rr_actors.base.checks import path_text
 from rr_actors.base.errors import ConfigError, GraphError
+from rr_actors.base.folder import may_block
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.toml import read_bytes, wrong
 from rr_actors.managers.planning.kept_record import KeptRecord
@@ -150,11 +151,6 @@ def one_file(path: str | Path) -> Sources:
     if may_block(Path(path)):
         raise wrong(str(path), "", "a file", path, said="a pipe, a socket or a device")
     return {str(path): read_bytes(str(path))}
-
-
-def may_block(path: Path) -> bool:
-    """Return whether to read this may wait for ever: a pipe, a socket or a device is in the place of a file."""
-    return path.exists() and not path.is_file() and not path.is_dir()
 
 
 def last_good_file(beginning: Beginning | None, path: Path, parse: Callable[[bytes, str], C]) -> LastGood[C]:

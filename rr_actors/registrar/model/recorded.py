@@ -6,6 +6,7 @@ and that of a callback its resource's id. If a callback loads, the load has that
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import msgspec
@@ -17,6 +18,7 @@ from rr_actors.registrar.model.messages import Message
 from rr_actors.registrar.model.rows import shown_priority
 
 _LONG = 1000  # the bytes of a request that is shown, at most
+_PUT_BACK_S = 0.25  # by which the time of one source falls if the clock is put back; threads may be late by less
 
 
 class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -57,6 +59,38 @@ class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
     server: str = ""
     detail: str = ""
     facts: dict[str, Any] = {}
+
+
+def in_order(entries: Iterable[Entry]) -> list[Entry]:
+    """Return entries in the order in which they happened, also if the clock was put back meanwhile.
+
+    A process sends its entries in batches, so one may arrive after a later one of another process: their times say
+    which was first. The entries of one source arrive in their order. If their time falls, the clock was put back: then
+    all that arrived before comes before.
+    """
+    ordered, of_one_clock = list[Entry](), list[Entry]()
+    newest = dict[str, float]()
+    for entry in sorted(entries, key=lambda one: one.seq):
+        source = _source(entry)
+        if source and entry.at < newest.get(source, entry.at) - _PUT_BACK_S:
+            ordered += sorted(of_one_clock, key=lambda one: one.at)
+            of_one_clock.clear()
+            newest.clear()
+        of_one_clock.append(entry)
+        newest[source] = max(entry.at, newest.get(source, entry.at))
+    return ordered + sorted(of_one_clock, key=lambda one: one.at)
+
+
+def _source(entry: Entry) -> str:
+    """Return what has noted an entry, whose entries arrive in their order: a supervisor, a registrar or a process.
+
+    A message may be noted long after the time that it was sent: "".
+    """
+    if entry.event in ("sent", "received"):
+        return ""
+    if entry.facts:
+        return entry.process.rpartition("/")[0] or entry.registrar
+    return f"{entry.process} {entry.pid}"
 
 
 def message_entry(at: float, event: str, process: str, pid: int, registrar: str, peer: str, message: Message) -> Entry:

@@ -9,10 +9,11 @@ from pathlib import Path
 import msgspec
 
 from rr_actors.base.errors import ConfigError
+from rr_actors.base.folder import open_plain, read_plain
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.supervision.event_history import Record
 from rr_actors.system.recording.event_memory import FILE, OLDER, event_in
-from rr_actors.system.recording.recordings import LINE_LIMIT, Recording, add, entry_of, read_recording
+from rr_actors.system.recording.recordings import LINE_LIMIT, Recording, add, entry_of, recording_in
 
 
 def read_events(path: str | os.PathLike[str]) -> Recording:
@@ -32,25 +33,27 @@ def read_events(path: str | os.PathLike[str]) -> Recording:
             raise ConfigError(
                 f"{path}: cannot be read: expected {expected}, got a directory without one", file=str(path)
             )
-        return _history(path, files)
+        return _history(path, [entry for file in files for entry in _read_history(file)])
     try:
-        with path.open("rb") as file:
+        with open_plain(path) as file:
             first = file.readline(LINE_LIMIT)
+            if first.startswith(b'{"event":'):
+                return _history(path, _entries_in(path, first + file.read()))
+            if not first:
+                raise ConfigError(f"{path}: expected a recording, or a {FILE}, got an empty file", file=str(path))
+            recording = recording_in(path, file, first)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}", file=str(path)) from error
-    if first.startswith(b'{"event":'):
-        return _history(path, [path])
-    recording = read_recording(path)
     for entry in recording.entries():
         _check(path, entry)
     return recording
 
 
-def _history(path: Path, files: list[Path]) -> Recording:
-    entries = [entry for file in files for entry in _read_history(file)]
+def _history(path: Path, entries: list[Entry]) -> Recording:
     recording = Recording(path.name, limit=max(1, len(entries)))
     add(recording, entries)
     recording.since = min((entry.at for entry in entries), default=0.0)
+    recording.is_history = True
     return recording
 
 
@@ -67,12 +70,15 @@ def _check(path: Path, entry: Entry) -> None:
 
 
 def _read_history(path: Path) -> list[Entry]:
-    entries: list[Entry] = []
     try:
-        lines = path.read_bytes().splitlines(keepends=True)
+        return _entries_in(path, read_plain(path))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}", file=str(path)) from error
-    for number, line in enumerate(lines, 1):
+
+
+def _entries_in(path: Path, history: bytes) -> list[Entry]:
+    entries: list[Entry] = []
+    for number, line in enumerate(history.splitlines(keepends=True), 1):
         try:
             event = event_in(line)
             time.localtime(event.at)

@@ -8,22 +8,24 @@ file can be read to the last whole line.
 from __future__ import annotations
 
 import functools
+import io
 import os
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import msgspec
 
 from rr_actors.base.errors import ConfigError, UsageError, counted, readable, shortened, shown, text_of
+from rr_actors.base.folder import open_plain
 from rr_actors.base.names import time_in
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.links.recorder import RECORDED, entries_of
-from rr_actors.registrar.model.recorded import Entry
+from rr_actors.registrar.model.recorded import Entry, in_order
 from rr_actors.registrar.pages import ResourceRow
 from rr_actors.registrar.queries import Query, ResourceInfo
 from rr_actors.system.recording.event_memory import Event
@@ -56,6 +58,42 @@ class Header(msgspec.Struct, frozen=True):
     recording: int
     system: str
     at: float
+
+
+class PresentChild(msgspec.Struct, frozen=True):
+    """A child that is there when a recording begins, and since when it is in its state."""
+
+    path: str
+    kind: str = ""
+    state: str = ""
+    pid: int | None = None
+    since: float | None = None
+
+
+class PresentResource(msgspec.Struct, frozen=True):
+    """A resource that is there when a recording begins, and since when."""
+
+    id: str
+    server: str = ""
+    text: str = ""
+    phase: str = ""
+    state: str = ""
+    message: str = ""
+    since: float | None = None
+
+
+class Present(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A part of what is there when a recording begins.
+
+    Attributes:
+        left_out: how many resources are not in any part.
+        notes: why more is not known.
+    """
+
+    children: list[PresentChild] = []
+    resources: list[PresentResource] = []
+    left_out: Annotated[int, msgspec.Meta(ge=0)] = 0
+    notes: list[str] = []
 
 
 class Recordings:
@@ -164,6 +202,7 @@ class Recording:
         path: the file that the entries are written to; None for a recording in memory.
         present: what was there when it began, as plain data: mappings with "children", "resources", "left_out" (how
             many resources are not among them), and "notes" (why others are not known).
+        is_history: whether it is the history of a state directory, which has events alone.
     """
 
     def __init__(
@@ -176,6 +215,7 @@ class Recording:
         self.missed = 0
         self.path = path
         self.present: list[dict[str, Any]] = []
+        self.is_history = False
         self._lock = threading.Lock()
         self._entries: deque[Entry] = deque(maxlen=limit)
         self._pid = os.getpid()
@@ -228,13 +268,15 @@ class Recording:
     def entries(self) -> list[Entry]:
         """Return the entries, oldest first. Those of the last tenth of a second may be missing.
 
+        If the clock was put back meanwhile, what was recorded before that comes first, with its later times.
+
         Raises:
             ConfigError: the recording's file cannot be read.
         """
         if self.path is not None:
             return read_recording(self.path).entries()
         with self._lock:
-            return sorted(self._entries, key=lambda entry: (entry.at, entry.seq))
+            return in_order(self._entries)
 
     def trace(self, what: Query[Any] | ResourceInfo | str) -> Trace:
         """Return the trace of one load: its messages and answers, its callbacks, and the loads that these made.
@@ -311,30 +353,31 @@ def present_entries(
         notes: why more are not known.
     """
     tree = [
-        {
-            "path": child["path"],
-            "kind": child["type"],
-            "state": child["state"],
-            "pid": child["pid"],
-            "since": None if child["up_s"] is None else now - child["up_s"],
-        }
+        PresentChild(
+            child["path"],
+            child["type"],
+            child["state"],
+            child["pid"],
+            None if child["up_s"] is None else now - child["up_s"],
+        )
         for child in children
     ]
     served = [
-        {
-            "id": row.id,
-            "server": row.server,
-            "text": row.text,
-            "phase": "revoked" if row.condition == "revoked" else row.phase,
-            "state": row.state or "OK",
-            "message": shortened(row.message),
-            "since": time_in(row.id),
-        }
+        PresentResource(
+            row.id,
+            row.server,
+            row.text,
+            "revoked" if row.condition == "revoked" else row.phase,
+            row.state or "OK",
+            shortened(row.message),
+            time_in(row.id),
+        )
         for row in resources
     ]
-    parts = [{"children": tree[at : at + _TOGETHER]} for at in range(0, len(tree), _TOGETHER)]
-    parts += [{"resources": served[at : at + _TOGETHER]} for at in range(0, len(served), _TOGETHER)]
-    return _lines_of([*parts, {"left_out": left_out, "notes": [shortened(note) for note in notes]}], now)
+    parts = [Present(tree[at : at + _TOGETHER]) for at in range(0, len(tree), _TOGETHER)]
+    parts += [Present(resources=served[at : at + _TOGETHER]) for at in range(0, len(served), _TOGETHER)]
+    last = {"left_out": left_out, "notes": [shortened(note) for note in notes]}  # it is there, whatever there was
+    return _lines_of([*map(msgspec.to_builtins, parts), last], now)
 
 
 def _lines_of(present: list[dict[str, Any]], at: float) -> list[Entry]:
@@ -486,14 +529,22 @@ def read_recording(path: str | os.PathLike[str]) -> Recording:
     """
     path = Path(path)
     try:
-        with path.open("rb") as file:
-            header = _decoded(path, 1, file.readline(LINE_LIMIT), Header)
-            if header.recording != VERSION:
-                text = f"{path}: a recording of version {header.recording}, expected {VERSION}: use the same rr_actors"
-                raise ConfigError(text, file=str(path))
-            lines = list(_lines(path, file))
+        with open_plain(path) as file:
+            return recording_in(path, file, file.readline(LINE_LIMIT))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}", file=str(path)) from error
+
+
+def recording_in(path: Path, file: io.BufferedReader, first: bytes) -> Recording:
+    """Return the recording in a file that is open, whose first line was read; raise what read_recording() raises."""
+    if not first:
+        raise ConfigError(f"{path}: expected a recording, got an empty file", file=str(path))
+    header = _decoded(path, 1, first, Header)
+    if header.recording != VERSION:
+        text = f"{path}: a recording of version {header.recording}, expected {VERSION}: use the same rr_actors"
+        raise ConfigError(text, file=str(path))
+    _check_time(path, 1, header.at)
+    lines = list(_lines(path, file))
     entries = [entry for entry in lines if entry.event not in (_MISSED, _PRESENT)]
     recording = Recording(header.system, limit=max(1, len(entries)))
     recording.since = header.at
@@ -502,27 +553,52 @@ def read_recording(path: str | os.PathLike[str]) -> Recording:
     return recording
 
 
-def _lines(path: Path, file: Any) -> Iterator[Entry]:
+def _lines(path: Path, file: io.BufferedReader) -> Iterator[Entry]:
     number = 1
     while line := file.readline(LINE_LIMIT):
         number += 1
         if not line.endswith(b"\n") and len(line) < LINE_LIMIT:  # cut off
             return
         entry = _decoded(path, number, line, Entry)
+        _check_time(path, number, entry.at)
+        if entry.event == _PRESENT:
+            _check_present(path, number, entry)
         count = entry.facts.get("count")
         if entry.event == _MISSED and not (type(count) is int and count >= 0):
-            text = f'{path}: line {number}: "missed": expected a whole number as "count", got {shown(entry.facts)}'
-            text += _whole_part(path, number)
-            raise ConfigError(text, file=str(path))
+            raise _damaged(path, number, 'a whole number as "count"', shown(entry.facts), '"missed": ')
         yield entry
+
+
+def _check_present(path: Path, number: int, entry: Entry) -> None:
+    """Raise ConfigError if the facts of an entry do not say what was there."""
+    try:
+        there = msgspec.convert(entry.facts, Present)
+    except msgspec.ValidationError as error:
+        expected = f"what rr-actors record writes ({error})"
+        raise _damaged(path, number, expected, shown(entry.facts), '"present": ') from error
+    for one in (*there.children, *there.resources):
+        _check_time(path, number, one.since or 0.0)
+
+
+def _check_time(path: Path, number: int, at: float) -> None:
+    """Raise ConfigError if a time cannot be shown."""
+    try:
+        time.localtime(at)
+    except (OverflowError, ValueError, OSError) as error:
+        raise _damaged(path, number, "a time, in seconds since the epoch", f"{at:g}") from error
+
+
+def _damaged(path: Path, number: int, expected: str, got: str, what: str = "") -> ConfigError:
+    text = f"{path}: line {number}: {what}expected {expected}, got {got}"
+    return ConfigError(text + _whole_part(path, number), file=str(path))
 
 
 def _decoded(path: Path, number: int, line: bytes, kind: Any) -> Any:
     try:
         return msgspec.json.decode(line, type=kind)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        text = f"{path}: line {number}: expected what rr-actors record writes, got {shown(line[:_TOLD])}: {error}"
-        raise ConfigError(text + _whole_part(path, number), file=str(path)) from error
+        got = f"{shown(line[:_TOLD])}: {error}"
+        raise _damaged(path, number, "what rr-actors record writes", got) from error
 
 
 def _whole_part(path: Path, number: int) -> str:

@@ -18,7 +18,7 @@ from rr_actors.base.checks import needing
 from rr_actors.base.errors import NotFound, UsageError, counted, did_you_mean, few, shown
 from rr_actors.base.names import named
 from rr_actors.base.notebook import bundle, table
-from rr_actors.registrar.model.recorded import Entry
+from rr_actors.registrar.model.recorded import Entry, in_order
 from rr_actors.system.recording.sequence_diagrams import sequence_of
 from rr_actors.system.recording.timings import ANSWERS, Timing, timings_of, trace_id_of
 
@@ -163,9 +163,7 @@ def messages_of(entries: Sequence[Entry], actors: Sequence[str]) -> Trace:
         for entry in entries
         if entry.event in events and (not actors or entry.registrar in wanted or entry.peer in wanted)
     ]
-    return Trace(
-        " ".join(actors), sorted([*chosen, *Index(entries).deaths(chosen, entries)], key=lambda one: (one.at, one.seq))
-    )
+    return Trace(" ".join(actors), in_order([*chosen, *Index(entries).deaths(chosen, entries)]))
 
 
 def trace_of(entries: Sequence[Entry], id: str, *, of_query: bool = False) -> Trace:
@@ -187,7 +185,7 @@ def trace_of(entries: Sequence[Entry], id: str, *, of_query: bool = False) -> Tr
     for load in loads:
         chosen |= known.below(load, of_query=of_query)
     found = [entries[number] for number in sorted(chosen)]
-    return Trace(id, sorted([*found, *known.deaths(found, found)], key=lambda entry: (entry.at, entry.seq)))
+    return Trace(id, in_order([*found, *known.deaths(found, found)]))
 
 
 class Index:
@@ -285,19 +283,21 @@ class Index:
         """Return the ends and starts of the children that took part, and the start after an end.
 
         Args:
-            during: between the first and the last of these entries.
+            during: between the first and the last of these entries, which are some of the recording's own.
         """
         if not chosen:
             return []
         names = {name for entry in chosen for name in (entry.registrar, entry.peer) if name}
-        first, last = min(entry.at for entry in during), max(entry.at for entry in during)
+        ids = set(map(id, during))  # times do not say the order: the clock may have been put back
+        numbers = [number for number, entry in enumerate(self.entries) if id(entry) in ids]
+        first, last = numbers[0], numbers[-1]
         down: set[str] = set()
         found: list[Entry] = []
-        for entry in self.entries:
+        for number, entry in enumerate(self.entries):
             name = entry.process if entry.process in names else entry.process.rpartition("/")[2]
-            if entry.event not in _ENDS or name not in names or entry.at < first:
+            if entry.event not in _ENDS or name not in names or number < first:
                 continue
-            if entry.at <= last or (entry.process in down and entry.event in _STARTS):
+            if number <= last or (entry.process in down and entry.event in _STARTS):
                 found.append(msgspec.structs.replace(entry, registrar=name))
                 (down.discard if entry.event in _STARTS else down.add)(entry.process)
         return found

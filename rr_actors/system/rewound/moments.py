@@ -34,6 +34,7 @@ _SAYS = ("unload_failed", "revoked")
 """The events whose details are the resource's message from then on."""
 _BEGINS = ("loaded", "load_failed")
 _LASTING = "FATAL"
+_IN_A_ROW_S = 2.0  # from one start of a supervisor's child to the next, at most
 
 
 class ChildThen(msgspec.Struct, frozen=True):
@@ -134,12 +135,15 @@ class Moment(msgspec.Struct, frozen=True):
         children: by path.
         resources: by id.
         asked: what loads ask for that have no answer yet, by the ids of their queries: the server, and the request.
+        first_starts: by the path of a supervisor, when the newest of its children's first starts in a row began and
+            ended: the begin of the first of them, and the end of the last.
     """
 
     at: float = 0.0
     children: dict[str, ChildThen] = {}
     resources: dict[str, ResourceThen] = {}
     asked: dict[str, tuple[str, str]] = {}
+    first_starts: dict[str, tuple[float, float]] = {}
 
     @property
     def tree(self) -> list[ChildThen]:
@@ -195,12 +199,14 @@ class Fold:
         self._children = moment.children.copy()
         self._resources = moment.resources.copy()
         self._asked = moment.asked.copy()
+        self._first_starts = moment.first_starts.copy()
         self._changes: list[Change] = []
 
     @property
     def moment(self) -> Moment:
         """The moment after the entries so far."""
-        return Moment(self._at, self._children.copy(), self._resources.copy(), self._asked.copy())
+        children, resources = self._children.copy(), self._resources.copy()
+        return Moment(self._at, children, resources, self._asked.copy(), self._first_starts.copy())
 
     def take(self, entry: Entry) -> list[Change]:
         """Apply an entry."""
@@ -229,7 +235,7 @@ class Fold:
             return
         state, kind = facts["state"], str(facts.get("kind", ""))
         if entry.event in _STARTS and facts.get("run") == 1:
-            self._forget_earlier_supervisor(path, entry.at - float(facts.get("ready_s") or 0.0))
+            self._forget_earlier_supervisor(path, entry.at - float(facts.get("ready_s") or 0.0), entry.at)
         if state is None:
             for other in (*self._below(path), path):
                 self._set_child(other, None)
@@ -244,12 +250,23 @@ class Fold:
             for other in self._below(path):
                 self._set_child(other, None)
 
-    def _forget_earlier_supervisor(self, path: str, began: float) -> None:
-        """Forget the children that a supervisor had which was killed: the first start of the next one has number 1."""
+    def _forget_earlier_supervisor(self, path: str, began: float, at: float) -> None:
+        """Forget the children that a supervisor had which was killed, at the first start of a child that is known.
+
+        A supervisor starts its children one after another. So the next one has those whose first starts are in a row.
+        A time that is later than this start is of a clock that was put back since.
+        """
         above = path.rpartition("/")[0]
+        first, last = self._first_starts.get(above, (began, began))
+        is_next = at >= last and began - last < _IN_A_ROW_S
+        first = min(first, began) if is_next else began
+        self._first_starts[above] = (first, at)
+        if path not in self._children:
+            return
         for other in self._below(above):
             since = self._children[other].since
-            if since is not None and since < began and not f"{other}/".startswith(f"{path}/"):
+            is_own = f"{other}/".startswith(f"{path}/")
+            if since is not None and other != path and not (began if is_own else first) <= since <= at:
                 self._set_child(other, None)
 
     def _add_supervisors(self, path: str, at: float) -> None:

@@ -30,7 +30,9 @@ def time_meant(text: str, since: float, until: float, option: str = "--at") -> f
     """
     at = _parsed(text.strip(), since, until)
     if at is None:
-        expected = "a time (12:46:55.020, +12.5s from the beginning, -3m before the end, start, end)"
+        expected = (
+            "a time (12:46:55.020, 2026-11-30 12:46:55.020, +12.5s from the beginning, -3m before the end, start, end)"
+        )
         raise UsageError(f"{option}: expected {expected}, got {shown(text)}")
     if not since - _NEAR_S <= at <= until + _NEAR_S:
         expected = f"a time from {_said(since)} to {_said(until)}"

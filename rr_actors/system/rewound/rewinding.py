@@ -15,7 +15,7 @@ from rr_actors.base.errors import ConfigError, UsageError, few, shown
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.recording.event_files import read_events
 from rr_actors.system.recording.event_texts import clock, event_text
-from rr_actors.system.recording.recordings import Recording
+from rr_actors.system.recording.recordings import Present, Recording
 from rr_actors.system.rewound.moments import Change, Fold, Moment, differences, first_moment, moment_after
 
 _KEPT = 100  # moments, at the most, from which others are folded
@@ -58,20 +58,22 @@ class Rewound:
         left_out: how many resources were there at the beginning that the recording does not have.
         notes: why more of the beginning is not known.
         knows_beginning: whether the recording noted what was there when it began; else the entries tell.
+        is_history: whether it is the history of a state directory, which has events alone.
     """
 
     def __init__(self, recording: Recording) -> None:
         self.title = recording.system
         self.missed = recording.missed
         self._entries = recording.entries()
-        present = recording.present
+        self.is_history = recording.is_history
+        present = msgspec.convert(recording.present, list[Present])
         self.knows_beginning = bool(present)
-        self.left_out = sum(part.get("left_out", 0) for part in present)
-        self.notes = [str(note) for part in present for note in part.get("notes", ())]
+        self.left_out = sum(part.left_out for part in present)
+        self.notes = [note for part in present for note in part.notes]
         first = self._entries[0].at if self._entries else recording.since
         self.since = min(recording.since or first, first)
         self.until = max((entry.at for entry in self._entries), default=self.since)
-        fold = Fold(first_moment(self._entries, present, self.since))
+        fold = Fold(first_moment(self._entries, recording.present, self.since))
         self._kept: list[tuple[int, Moment]] = [(0, fold.moment)]  # how many entries each has
         apart = max(_APART, len(self._entries) // _KEPT)
         self.steps: list[Step] = []
@@ -83,6 +85,11 @@ class Rewound:
             if count % apart == 0:
                 self._kept.append((count, fold.moment))
         self._times = list(itertools.accumulate((step.at for step in self.steps), max))
+
+    @property
+    def has_entries(self) -> bool:
+        """Whether anything was recorded."""
+        return bool(self._entries)
 
     def __len__(self) -> int:
         return len(self.steps)
@@ -141,7 +148,7 @@ def rewind(what: Recording | str | os.PathLike[str]) -> Rewound:
     recording = what if isinstance(what, Recording) else read_events(what)
     try:
         return Rewound(recording)
-    except (msgspec.MsgspecError, TypeError, ValueError) as error:
+    except msgspec.ValidationError as error:
         where = recording.system if isinstance(what, Recording) else os.fspath(what)
         text = f'{where}: "present": expected what rr-actors record writes: {error}'
         raise ConfigError(text, file=str(where)) from error

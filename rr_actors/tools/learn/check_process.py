@@ -14,6 +14,7 @@ from typing import IO
 
 import msgspec
 
+from rr_actors.base.folder import read_plain
 from rr_actors.runtime.processes.lifeline import kill_group
 from rr_actors.tools.learn.learn_exercises import Exercise
 from rr_actors.tools.learn.scenes import Outcome
@@ -25,15 +26,14 @@ _KEPT = 4000  # bytes of what a file prints
 
 
 def check_file(exercise: Exercise, file: Path, limit_s: float = LIMIT_S) -> Outcome:
-    """Check a learner's file, and return what was found. Blocks for `limit_s` seconds at most.
-
-    Raises:
-        OSError: the file cannot be read.
-    """
+    """Check a learner's file, and return what was found. Blocks for `limit_s` seconds at most."""
     try:
-        compile(file.read_bytes(), file.name, "exec")
+        compile(read_plain(file), file.name, "exec")
     except SyntaxError as error:
-        return _cannot_be_read(error, file)
+        return _is_no_program(error, file)
+    except OSError as error:
+        got = error.strerror or str(error)
+        return Outcome(False, "the file cannot be read", file.name, "a file that you can read", got)
     except (ValueError, RecursionError, MemoryError) as error:
         got = str(error) or type(error).__name__
         return Outcome(False, "the file is no Python program", file.name, "a Python program in UTF-8", got)
@@ -49,7 +49,7 @@ def check_as_given(exercise: Exercise, limit_s: float = LIMIT_S) -> Outcome:
         return check_file(exercise, file, limit_s)
 
 
-def _cannot_be_read(error: SyntaxError, file: Path) -> Outcome:
+def _is_no_program(error: SyntaxError, file: Path) -> Outcome:
     line = (error.text or "").rstrip()
     pointer = f"\n{' ' * (max(error.offset or 1, 1) - 1)}^" if line else ""
     where = f"line {error.lineno or 1} of {file.name}"

@@ -12,6 +12,7 @@ from pathlib import Path
 import msgspec
 
 from rr_actors.base.errors import UsageError
+from rr_actors.base.folder import read_plain
 from rr_actors.tools.learn.learn_exercises import Exercise, all_exercises
 
 FILE = "progress.json"
@@ -93,7 +94,7 @@ class LearnerFolder:
             UsageError: it is none, or cannot be read.
         """
         try:
-            progress = msgspec.json.decode((path / FILE).read_bytes(), type=LearnerProgress)
+            progress = msgspec.json.decode(read_plain(path / FILE), type=LearnerProgress)
         except (FileNotFoundError, NotADirectoryError):
             what = "nothing of that name" if not path.exists() else f"no {FILE} in it" if path.is_dir() else "a file"
             raise _no_folder(path, what) from None

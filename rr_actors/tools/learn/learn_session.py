@@ -164,9 +164,10 @@ class Session:
         _head(self._folder, exercise)
         if not self._folder.step(exercise).answer and not self._ask(exercise, keys):
             return False
+        saved = SavedFile(self._folder.file(exercise))  # before the check: a save during it is seen
         passed = check_once(self._folder, exercise, self._limit_s)
         self._say_keys(passed)
-        for key in self._events(exercise, keys):
+        for key in self._events(saved, keys):
             match key:
                 case "q":
                     return False
@@ -193,9 +194,8 @@ class Session:
             say("It is checked when you save it.")
         say("n next exercise   l list   q quit" if passed else _KEYS)
 
-    def _events(self, exercise: Exercise, keys: Keys) -> Iterator[str]:
+    def _events(self, saved: SavedFile, keys: Keys) -> Iterator[str]:
         """Yield each key, and "saved" for each save of the file."""
-        saved = SavedFile(self._folder.file(exercise))
         while True:
             if saved.look():
                 yield "saved"

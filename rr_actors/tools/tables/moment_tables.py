@@ -40,11 +40,14 @@ def caveats(rewound: Rewound) -> list[str]:
     if rewound.left_out:
         said.append(f"{counted(rewound.left_out, 'resource')} of the beginning are not in the recording")
     said += [f"what was there at the beginning is not all known: {note}" for note in rewound.notes]
-    if not rewound.knows_beginning:
+    if rewound.is_history:
         said.append(
             "the file does not say what was there when it began; a history has no load and no unload that went well, "
             "so it lacks resources, and has some that are unloaded"
         )
+    elif not rewound.knows_beginning:
+        what = "what no entry names is missing" if rewound.has_entries else "it has only its header"
+        said.append(f"the recording does not say what was there when it began; {what}")
     return said
 
 

@@ -14,6 +14,7 @@ import typer
 
 from rr_actors.base.checks import needing
 from rr_actors.base.errors import NotRunning, UsageError, counted, shown
+from rr_actors.base.folder import read_plain
 from rr_actors.base.values.canonical import Codec
 from rr_actors.system.console import console_commands as commands
 from rr_actors.system.console import console_messages as c
@@ -431,7 +432,7 @@ def start(
 ) -> None:
     """Add a child to the running tree, and start it. Its class is imported by the running system, by its name."""
     try:
-        text = spec if id else Path(spec).read_text()
+        text = spec if id else read_plain(spec).decode()
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"{spec}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
     carry_out(state, commands.StartChild(text, under, "" if id else spec, dry_run, id), as_json)

@@ -199,13 +199,18 @@ def rewind(
         typer.Argument(metavar="RECORDING|STATE_DIR", help="A file of `record`, a state directory, or its history."),
     ],
     at: Annotated[
-        str, typer.Option(metavar="TIME", help="12:46:55.020; or +12.5s from the beginning, -3m before the end.")
-    ] = "",
+        str | None, typer.Option(metavar="TIME", help="12:46:55.020; or +12.5s from the beginning, -3m before the end.")
+    ] = None,
     when: Annotated[
-        str, typer.Option(metavar="WHAT STATE", help="When it became so: 'cameras ERROR', 'root/maps restarting'.")
-    ] = "",
-    start: Annotated[str, typer.Option("--from", metavar="TIME", help="Show what is different since then.")] = "",
-    end: Annotated[str, typer.Option("--to", metavar="TIME", help="With --from: until then. Default: the end.")] = "",
+        str | None,
+        typer.Option(metavar="WHAT STATE", help="When it became so: 'cameras ERROR', 'root/maps restarting'."),
+    ] = None,
+    start: Annotated[
+        str | None, typer.Option("--from", metavar="TIME", help="Show what is different since then.")
+    ] = None,
+    end: Annotated[
+        str | None, typer.Option("--to", metavar="TIME", help="With --from: until then. Default: the end.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Show the tree and the resources as they were at any moment of a recording; in a terminal, step by step.
@@ -213,22 +218,24 @@ def rewind(
     In a terminal, arrows step back and forward, and ? shows all keys. With an option, or without a terminal, it prints
     the moment at a time, or the last one; when something came into a state; or what is different between two times.
     """
-    if sum(map(bool, (at, when, start or end))) > 1:
+    is_between = start is not None or end is not None
+    asked = (at is not None) + (when is not None) + is_between
+    if asked > 1:
         raise UsageError("rewind: expected one of --at, --when, and --from with --to, got several")
     rewound = rewound_of(what)
-    if not (at or when or start or end or as_json) and all(one.isatty() for one in (sys.stdin, sys.stdout)):
+    if not (asked or as_json) and all(one.isatty() for one in (sys.stdin, sys.stdout)):
         from rr_actors.tools.terminal import rewind_screen  # textual, which the other verbs do without
 
         rewind_screen.watch(rewound)
         return
     for caveat in then.caveats(rewound):
         say(caveat, err=True)
-    if when:
+    if when is not None:
         _say_when(rewound, when, as_json)
-    elif start or end:
-        _say_between(rewound, start or "start", end or "end", as_json)
+    elif is_between:
+        _say_between(rewound, "start" if start is None else start, "end" if end is None else end, as_json)
     else:
-        _say_moment(rewound, time_meant(at or "end", rewound.since, rewound.until), as_json)
+        _say_moment(rewound, time_meant("end" if at is None else at, rewound.since, rewound.until), as_json)
 
 
 def _number(rewound: Rewound, text: str, option: str) -> int:

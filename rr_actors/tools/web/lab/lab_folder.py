@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import NamedTuple, TypeVar, get_args, get_type_hints
 
 from rr_actors.base.errors import ConfigError, UsageError, did_you_mean
+from rr_actors.base.folder import read_plain
 from rr_actors.base.toml import parse_typed, raise_faults, wrong
 from rr_actors.system.event_subscribers import ChildEvent
 from rr_actors.tools.web.lab.lab_declarations import LabDeclaration, LabExperiment, Lever, Sign
@@ -132,7 +133,7 @@ def read_experiment(file: Path) -> LabExperiment:
 
 def _parsed(file: Path) -> tuple[str, ast.Module]:
     try:
-        text = file.read_text("utf-8")
+        text = read_plain(file).decode()
         return text, ast.parse(text)
     except OSError as error:
         said = error.strerror or str(error)
