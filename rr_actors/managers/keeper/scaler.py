@@ -172,7 +172,7 @@ def _probed(on: ScaleOn, count: int) -> Reading:
     """Ask the probe. In a thread of its own."""
     try:
         value: object = probe_of(on.probe)()
-    except (Exception, SystemExit) as error:  # a user's function may raise anything
+    except BaseException as error:  # a user's function may raise anything
         raise NoReading(f"{on.label} raised {text_of(error)}") from error
     if not is_number(value):
         raise NoReading(f"{on.label} returned {shown(value)}, not a finite number")
