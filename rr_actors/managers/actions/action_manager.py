@@ -278,6 +278,8 @@ class Actions(Manager):
             NotFound: no graph of this id runs here. `.id`, `.known`
             Unavailable: the manager of an action has not confirmed within 5 s that the action is to stop, so it may run
                 on. That manager hears it when it answers again.
+            CatalogError: the disk refuses to write it. The actions have heard it all the same, and none begins while
+                this process lives; after a crash before there is room the graph goes on.
         """
         self._say(graph, Halt())
 
@@ -287,7 +289,7 @@ class Actions(Manager):
         Raises:
             NotFound: no graph of this id runs here. `.id`, `.known`
             GraphError: it has ended.
-            Unavailable: as for stop_graph().
+            Unavailable, CatalogError: as for stop_graph().
         """
         if (state := self._engine(graph).run.state) in ENDED:
             raise wrong_graph("", "graph_state", "one of RUNNING, PAUSED, HALTED", state)
@@ -565,7 +567,10 @@ class Actions(Manager):
             control.tell(word, step)
         with self._lock:
             sub_graph = self._engines.get(self._instances.get(key, ""))
-        said = sub_graph.tell(_EVENTS[word]) if sub_graph is not None else []
+        try:
+            said = sub_graph.tell(_EVENTS[word]) if sub_graph is not None else []
+        except CatalogError as error:
+            said = [str(error)]
         return lambda within_s: "; ".join(said)
 
     def _tell_there(self, actor: str, key: str, word: Word | Literal["over"], step: int, told: threading.Event) -> None:
