@@ -438,6 +438,19 @@ def test_what_is_to_give_way_does_so_when_a_full_disk_has_room(house: House, cap
     assert pid_of(house.system, "budgets") == pid
 
 
+def test_a_capacity_that_a_full_disk_refuses_holds_and_is_written_when_there_is_room(house: House) -> None:
+    record = house.system.state_dir / "budgets" / "budgets.json"
+    pid = pid_of(house.system, "budgets")
+    before = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, (0, before[1]))
+    house.set_capacity(50)
+    assert house.pool().capacity == 50
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, before)
+    assert eventually(lambda: record.exists() and "50" in record.read_text())
+    wait_respawned(house.system, "budgets", kill(house.system, "budgets"))
+    assert house.pool().capacity == 50
+
+
 def test_a_reserve_that_is_not_needed_stops_when_a_full_disk_has_room(
     start: Start, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -167,6 +167,10 @@ class Scaler:
             self._record.now = KeptScales(scales)
             self._record.save()
 
+    def catch_up(self) -> bool:
+        """Write the numbers, if the disk has refused that. Return whether they are on disk."""
+        return self._record is None or self._record.catch_up()
+
 
 def _probed(on: ScaleOn, count: int) -> Reading:
     """Ask the probe. In a thread of its own."""
