@@ -145,8 +145,9 @@ def test_what_is_wrong_is_refused_by_name(house: House) -> None:
     for capacity in wrong:
         with pytest.raises(rr.ConfigError, match="capacity: expected a number of at least 0"):
             house.set_capacity(capacity)
-    with pytest.raises(rr.NotFound, match="no pool 'volts': expected one of watts"):
-        house.system.ref("budgets").proxy().set_capacity("volts", 1).get()
+    for name, said in (("volts", "'volts'"), (["watts"], r"\['watts'\]")):
+        with pytest.raises(rr.NotFound, match=f"no pool {said}: expected one of watts"):
+            house.system.ref("budgets").proxy().set_capacity(name, 1).get()
     assert house.pool() == PoolInfo("watts", 100, 0, 0)
 
 

@@ -29,6 +29,7 @@ from rr_actors.base.errors import (
     Unavailable,
     UnknownRegistrar,
     UsageError,
+    is_a,
     shown,
 )
 from rr_actors.base.names import is_planned, new_id, short_id
@@ -344,7 +345,7 @@ class Actions(Manager):
 
     def _engine(self, graph: str) -> GraphEngine:
         with self._lock:
-            engine, known = self._engines.get(graph), tuple(self._engines)
+            engine, known = self._engines.get(graph) if is_a(graph, str) else None, tuple(self._engines)
         if engine is None:
             raise NotFound(
                 f"no graph {shown(graph)}: expected one of {', '.join(known) or 'none'}", id=graph, known=known

@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 
 from rr_actors.actors.actor_tables import TableColumn, table
-from rr_actors.base.errors import LoadFailed, NotFound, OverCapacity, UnknownQuery, UsageError, shown, text_of
+from rr_actors.base.errors import LoadFailed, NotFound, OverCapacity, UnknownQuery, UsageError, is_a, shown, text_of
 from rr_actors.base.names import made_at
 from rr_actors.base.reporting.log import Log
 from rr_actors.managers.budgets.books import Book, Books, most_of
@@ -218,7 +218,7 @@ class Budgets(Manager):
         return request.amount
 
     def _pool(self, name: str) -> Pool:
-        if name not in self._pools:
+        if not is_a(name, str) or name not in self._pools:
             known = tuple(sorted(self._pools))
             text = f"no pool {shown(name)}: expected one of {', '.join(known) or 'none'}"
             raise NotFound(text, id=name, known=known)
