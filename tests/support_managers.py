@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import time
 from dataclasses import dataclass
@@ -60,8 +61,10 @@ class Shop(rr.Manager):
 
 
 def queue_length() -> float:
-    """Return the number in the file that RR_TEST_QUEUE names; hang while that says "hang"."""
+    """Return the number in the file that RR_TEST_QUEUE names; hang while that says "hang", be cancelled if "cancel"."""
     file = Path(os.environ["RR_TEST_QUEUE"])
     while (text := file.read_text()) == "hang":
         time.sleep(0.01)
+    if text == "cancel":
+        raise asyncio.CancelledError  # no Exception
     return float(text)

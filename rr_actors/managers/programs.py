@@ -20,7 +20,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec.structs import replace
 
-from rr_actors.base.errors import CatalogError, InvalidRequest, NotFound, RrError, UsageError, shown
+from rr_actors.base.errors import CatalogError, InvalidRequest, NotFound, RrError, UsageError, is_a, shown
 from rr_actors.base.names import check_name
 from rr_actors.base.reporting.log import Log
 from rr_actors.managers.external_programs import (
@@ -190,12 +190,15 @@ class Programs(Manager):
 
         Raises:
             NotFound: there is no such program. `.id`, `.known`
+            UsageError: `lines` is no number of at least 1.
         """
         known = tuple(info.id for info in self.registrar.resources())
+        if not is_a(lines, int) or is_a(lines, bool) or lines < 1:
+            raise UsageError(f"output: lines: expected a whole number of at least 1, got {shown(lines)}")
         if program not in known:
             text = f"no program {shown(program)}: expected one of {', '.join(known) or 'none'}"
             raise NotFound(text, id=program, known=known)
-        return list(self._external.last_output(program, max(1, lines)))
+        return list(self._external.last_output(program, lines))
 
     @server("program", idle="pause", health=Health())  # each as its request and its manager say: see _adapted()
     def run_program(self, request: RunProgram) -> Program:

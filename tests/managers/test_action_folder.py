@@ -12,6 +12,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.managers import Actions, RunAction, RunGraph, run_graph
+from rr_actors.managers.actions.action_folder import ActionFolder
 from rr_actors.managers.actions.graph_documents import read_graph
 from rr_actors.managers.actions.graph_library import Shelf
 from support import eventually, kill, pid_of, wait_respawned
@@ -160,6 +161,7 @@ WRONG: list[tuple[str, str]] = [
     (f"{HEAD}\n1 / 0\n", "line 5: expected a Python file with a class of actions, got ZeroDivisionError: "),
     ("import no_such_module\n", "line 1: expected a Python file with a class of actions, got ModuleNotFoundError: "),
     ("raise SystemExit(3)\n", "line 1: expected a Python file with a class of actions, got SystemExit: 3"),
+    ("raise KeyboardInterrupt\n", "line 1: expected a Python file with a class of actions, got KeyboardInterrupt: "),
     ("", "expected a Python file with a class of actions, got none"),
     (f"{HEAD}class Base(rr.Action):\n    pass\n", "expected a Python file with a class of actions, got none"),
     (tell("x", isolate=False).replace("isolate = False", "timeout_s = 3"), "line 8: expected a class of actions that"),
@@ -217,6 +219,24 @@ def test_a_file_that_runs_when_the_process_is_killed_from_outside_is_not_blamed(
         assert eventually((tmp_path / "runs").exists)
         kill(place.system, "actions")
         assert saying.result(60) == "two"
+
+
+def test_a_file_that_has_not_ended_holds_up_nobody_and_holds_when_it_has(tmp_path: Path, folder: Path) -> None:
+    actions = ActionFolder(folder, None, {}, within_s=0.05)
+    head = f"{HEAD}import time\nfrom pathlib import Path\n"
+    waits = f"{head}while not Path({str(tmp_path / 'go')!r}).exists():\n    time.sleep(0.01)\n"
+    (folder / "tell.py").write_text(waits + tell("two", "Two")[len(HEAD) :])
+    (folder / "other.py").write_text(tell("other", "Other"))
+    assert actions.look()
+    assert sorted(actions.kinds) == ["Other", "Tell"]
+    (fault,) = actions.faults.values()
+    assert str(fault).endswith(
+        "tell.py: expected a Python file with a class of actions, got one that has not ended within 0.05 s"
+    )
+    assert not actions.look()
+    (tmp_path / "go").touch()
+    assert eventually(actions.look)
+    assert (sorted(actions.kinds), actions.faults) == (["Other", "Two"], {})
 
 
 def test_a_file_that_is_wrong_fails_the_start(tmp_path: Path, folder: Path) -> None:

@@ -315,8 +315,9 @@ def test_a_graph_can_be_stopped_paused_and_resumed_by_messages(robot: Robot, tmp
         assert eventually(lambda: robot.cameras() == 1)
         robot.messages.stop_graph(query.resource_id).get()
         assert eventually(lambda: query.response["graph_state"] == "STOPPED")
-    with pytest.raises(rr.NotFound, match="no graph 'x'"):
-        robot.messages.stop_graph("x").get()
+    for id, said in (("x", "'x'"), (["x"], r"\['x'\]")):
+        with pytest.raises(rr.NotFound, match=f"no graph {said}"):
+            robot.messages.stop_graph(id).get()
 
 
 def test_what_is_said_to_a_graph_as_soon_as_it_is_loaded_is_not_lost(robot: Robot, tmp_path: Path) -> None:

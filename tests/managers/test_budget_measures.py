@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import threading
 from collections.abc import Callable, Iterator
@@ -106,6 +107,17 @@ def test_a_gauge_says_what_a_probe_reads_and_what_is_wrong_with_it(told: Told) -
     assert eventually(lambda: "raised OSError: no battery" in told.problems.items)
     told.now = lambda: "much"
     assert eventually(lambda: "returned 'much', not a finite number" in told.problems.items)
+    told.now = lambda: 2
+    assert eventually(lambda: 2.0 in told.readings.items)
+
+
+def test_a_probe_that_raises_what_is_no_exception_is_asked_again(told: Told) -> None:
+    def cancelled() -> float:
+        raise asyncio.CancelledError
+
+    told.now = cancelled
+    told.gauge.start()
+    assert eventually(lambda: "raised CancelledError: " in told.problems.items)
     told.now = lambda: 2
     assert eventually(lambda: 2.0 in told.readings.items)
 

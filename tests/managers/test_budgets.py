@@ -145,8 +145,9 @@ def test_what_is_wrong_is_refused_by_name(house: House) -> None:
     for capacity in wrong:
         with pytest.raises(rr.ConfigError, match="capacity: expected a number of at least 0"):
             house.set_capacity(capacity)
-    with pytest.raises(rr.NotFound, match="no pool 'volts': expected one of watts"):
-        house.system.ref("budgets").proxy().set_capacity("volts", 1).get()
+    for name, said in (("volts", "'volts'"), (["watts"], r"\['watts'\]")):
+        with pytest.raises(rr.NotFound, match=f"no pool {said}: expected one of watts"):
+            house.system.ref("budgets").proxy().set_capacity(name, 1).get()
     assert house.pool() == PoolInfo("watts", 100, 0, 0)
 
 
@@ -436,6 +437,19 @@ def test_what_is_to_give_way_does_so_when_a_full_disk_has_room(house: House, cap
     assert house.ended.wait(1) == ["a"]
     eventually(lambda: house.pool().used == 30)
     assert pid_of(house.system, "budgets") == pid
+
+
+def test_a_capacity_that_a_full_disk_refuses_holds_and_is_written_when_there_is_room(house: House) -> None:
+    record = house.system.state_dir / "budgets" / "budgets.json"
+    pid = pid_of(house.system, "budgets")
+    before = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, (0, before[1]))
+    house.set_capacity(50)
+    assert house.pool().capacity == 50
+    resource.prlimit(pid, resource.RLIMIT_FSIZE, before)
+    assert eventually(lambda: record.exists() and "50" in record.read_text())
+    wait_respawned(house.system, "budgets", kill(house.system, "budgets"))
+    assert house.pool().capacity == 50
 
 
 def test_a_reserve_that_is_not_needed_stops_when_a_full_disk_has_room(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -12,7 +13,7 @@ import rr_actors as rr
 from rr_actors.managers.actions.graph_documents import read_graph
 from rr_actors.managers.actions.graph_engine import GraphEngine
 from rr_actors.managers.actions.graph_library import Shelf
-from rr_actors.managers.actions.graph_runs import Begin, NodeEnded, first_run
+from rr_actors.managers.actions.graph_runs import Begin, Event, Halt, NodeEnded, Pause, first_run
 from support import Calls, eventually
 
 GRAPH = read_graph(
@@ -26,13 +27,15 @@ GRAPH = read_graph(
 
 
 class FakeManager:
-    """Runs actions that end at once, or raise. `begun` has their names, `written` the states of the graph.
+    """Runs actions that end when `goes_on` is set, or raise. `begun` has their names, `written` the graph's states.
 
     `then` is called once, right after the next commit.
     """
 
     def __init__(self, errors: dict[str, Exception] | None = None) -> None:
-        self.begun, self.written = Calls(), Calls()
+        self.begun, self.written, self.told = Calls(), Calls(), Calls()
+        self.goes_on = threading.Event()
+        self.goes_on.set()
         self.refusals = 0
         self.then: Callable[[], object] = lambda: None
         self._errors = errors or {}
@@ -57,11 +60,13 @@ class FakeManager:
         return SimpleNamespace(unload=lambda: None)
 
     def tell_run(self, actor: str, key: str, word: Any, step: int) -> Callable[[float], str]:
+        self.told((key.partition("/")[2], word))
         return lambda within_s: ""
 
     def wait_over(self, actor: str, key: str) -> None: ...
 
     def end_of(self, query: Any, node: str, run: Any) -> NodeEnded:
+        self.goes_on.wait(60)
         return NodeEnded(node, run.number, "on_true")
 
 
@@ -87,6 +92,33 @@ def test_the_end_of_an_action_that_a_full_disk_refuses_is_not_lost() -> None:
 
     assert [*manager.begun] == ["First_0", "Second_0"]
     assert manager.engine.run.state == "FINISHED"
+
+
+@pytest.mark.parametrize(
+    ("events", "word", "end"),
+    [
+        ([Halt()], "stop", "STOPPED"),
+        ([Pause()], "pause", "PAUSED"),
+        ([Pause(), Halt()], "stop", "STOPPED"),
+        ([Halt(), Pause()], "stop", "STOPPED"),
+    ],
+)
+def test_a_stop_or_a_pause_reaches_what_runs_also_if_the_disk_is_full(events: list[Event], word: str, end: str) -> None:
+    manager = FakeManager()
+    manager.goes_on.clear()
+    manager.engine.begin(Begin())
+    assert eventually(lambda: [*manager.begun] == ["First_0"])
+    manager.refusals = 1000
+    for event in events:
+        with pytest.raises(rr.CatalogError, match="no room; its actions are told to"):
+            manager.engine.tell(event)
+    assert manager.told.items[-1] == ("First_0/1", word)
+    assert manager.engine.said("g/First_0/1")[0] == word
+    manager.goes_on.set()  # the action ends before there is room: its child does not begin
+    manager.refusals = 0
+    assert eventually(lambda: manager.engine.run.state == end)
+    manager.engine.close(30)
+    assert [*manager.begun] == ["First_0"]
 
 
 @pytest.mark.parametrize("error", [rr.UnknownRegistrar("nobody"), rr.RegistrarDown("gone"), rr.CatalogError("no room")])

@@ -446,6 +446,7 @@ def test_a_probe_says_what_there_is_to_do(make: Make, tmp_path: Path, monkeypatc
     for text, said in (
         ("nan", "returned nan, not a finite number"),
         ("many", "raised ValueError: could not convert string to float: 'many'"),
+        ("cancel", "raised CancelledError"),
         ("hang", "has not been read within 0.2 s"),
     ):
         queue.write_text(text)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import queue
 import threading
 import time
@@ -172,10 +173,15 @@ def test_an_unexpected_error_makes_the_manager_fail_with_it_and_ends_all_waiting
     assert time.monotonic() - began < 30
 
 
-@pytest.mark.parametrize("begin", ["two of one key", "a call with a defect", "an end with a defect"])
+@pytest.mark.parametrize(
+    "begin", ["two of one key", "a call with a defect", "a call that is cancelled", "an end with a defect"]
+)
 def test_a_defect_of_a_step_is_loud(watched: Watched, begin: str) -> None:
     def defect(*_: object) -> Any:
         raise KeyError("a defect")
+
+    def cancelled() -> None:
+        raise asyncio.CancelledError
 
     match begin:
         case "two of one key":
@@ -183,11 +189,13 @@ def test_a_defect_of_a_step_is_loud(watched: Watched, begin: str) -> None:
             watched.begin(Reply())
         case "a call with a defect":
             watched.loop.tell(lambda: watched.loop.begin_call("a", "", defect, watched.ended.put))
+        case "a call that is cancelled":
+            watched.loop.tell(lambda: watched.loop.begin_call("a", "", cancelled, watched.ended.put))
         case _:
             reply: Reply[str] = Reply()
             reply.set("on")
             watched.loop.tell(lambda: watched.loop.begin("a", "", lambda: reply, defect))
-    assert isinstance(watched.failed.get(timeout=60), (RuntimeError, KeyError))
+    assert isinstance(watched.failed.get(timeout=60), (RuntimeError, KeyError, asyncio.CancelledError))
 
 
 class Steps:

@@ -35,6 +35,9 @@ def test_the_output_of_a_program_is_shown_by_its_id_or_name(rr_system: Start) ->
         assert said.stdout.splitlines() == lines[1:], said.stderr
         wrong = run_cli("logs", program.resource_id, "--follow", "--state", system.state_dir)
         assert (wrong.returncode, "expected a child for --follow" in wrong.stderr) == (2, True)
+        for lines in (0, -5, "all", True):
+            with pytest.raises(rr.UsageError, match="output: lines: expected a whole number of at least 1, got"):
+                system.ref("programs").proxy().output(program.resource_id, lines).get(timeout=30)
         id = program.resource_id
     with pytest.raises(rr.NotFound, match=f"no program '{id}': expected one of none"):
         system.ref("programs").proxy().output(id).get(timeout=30)

@@ -29,6 +29,7 @@ from rr_actors.base.errors import (
     Unavailable,
     UnknownRegistrar,
     UsageError,
+    is_a,
     shown,
 )
 from rr_actors.base.names import is_planned, new_id, short_id
@@ -278,6 +279,8 @@ class Actions(Manager):
             NotFound: no graph of this id runs here. `.id`, `.known`
             Unavailable: the manager of an action has not confirmed within 5 s that the action is to stop, so it may run
                 on. That manager hears it when it answers again.
+            CatalogError: the disk refuses to write it. The actions have heard it all the same, and none begins while
+                this process lives; after a crash before there is room the graph goes on.
         """
         self._say(graph, Halt())
 
@@ -287,7 +290,7 @@ class Actions(Manager):
         Raises:
             NotFound: no graph of this id runs here. `.id`, `.known`
             GraphError: it has ended.
-            Unavailable: as for stop_graph().
+            Unavailable, CatalogError: as for stop_graph().
         """
         if (state := self._engine(graph).run.state) in ENDED:
             raise wrong_graph("", "graph_state", "one of RUNNING, PAUSED, HALTED", state)
@@ -342,7 +345,7 @@ class Actions(Manager):
 
     def _engine(self, graph: str) -> GraphEngine:
         with self._lock:
-            engine, known = self._engines.get(graph), tuple(self._engines)
+            engine, known = self._engines.get(graph) if is_a(graph, str) else None, tuple(self._engines)
         if engine is None:
             raise NotFound(
                 f"no graph {shown(graph)}: expected one of {', '.join(known) or 'none'}", id=graph, known=known
@@ -565,7 +568,10 @@ class Actions(Manager):
             control.tell(word, step)
         with self._lock:
             sub_graph = self._engines.get(self._instances.get(key, ""))
-        said = sub_graph.tell(_EVENTS[word]) if sub_graph is not None else []
+        try:
+            said = sub_graph.tell(_EVENTS[word]) if sub_graph is not None else []
+        except CatalogError as error:
+            said = [str(error)]
         return lambda within_s: "; ".join(said)
 
     def _tell_there(self, actor: str, key: str, word: Word | Literal["over"], step: int, told: threading.Event) -> None:

@@ -111,6 +111,7 @@ class GraphEngine:
         self._threads: set[threading.Thread] = set()
         self._changing = threading.RLock()
         self._closed = False
+        self._unwritten: Halt | Pause | None = None  # the runs have it; the disk has refused it, and takes nothing else
         self._begun = threading.Event()  # the first event is on disk: messages wait for that
         if run.steps:
             self._begun.set()
@@ -201,7 +202,10 @@ class GraphEngine:
         run = self._run
         runs = {self._key(name, node): node for some in (run.nodes, run.leaving) for name, node in some.items()}
         state = runs[key].state if key in runs and not self._closed else ""
-        return _WORDS.get(state, "stop"), run.steps
+        word = _WORDS.get(state, "stop")
+        if self._unwritten is not None and word == "run":
+            word = _word_of(self._unwritten)
+        return word, run.steps
 
     def tell(self, event: Event, query: Query | None = None) -> list[str]:
         """Take an event: decide, commit, and do what follows from it.
@@ -215,7 +219,8 @@ class GraphEngine:
         Raises:
             GraphError: the event is none that the graph can have.
             UnknownQuery: the graph is not there any more.
-            CatalogError: it cannot be written, and nothing has happened.
+            CatalogError: it cannot be written, and nothing has happened. Only a Halt or a Pause is told to what runs,
+                and is written as soon as there is room, before anything else: a robot stops also if the disk is full.
         """
         if not isinstance(event, Begin):
             self._begun.wait()
@@ -228,11 +233,18 @@ class GraphEngine:
             ):
                 timer.cancel()
             left = self._run.leaving
-            run, effects = decide(self._graph, self._run, event)
             stale: list[Query] = []
-            is_new = run is not self._run
+            try:
+                self._write_unwritten()
+                run, effects = decide(self._graph, self._run, event)
+                is_new = run is not self._run
+                if is_new:
+                    self._commit(graph, run, event)
+            except CatalogError as error:
+                if not isinstance(event, Halt | Pause):
+                    raise
+                raise self._tell_unwritten(event, error) from error
             if is_new:
-                self._commit(graph, run, event)
                 if graph is not self._graph:
                     stale += self._take_kept(self._kept.keys() - graph.unchanged(self._graph))
                 self._graph, self._run = graph, run
@@ -246,6 +258,56 @@ class GraphEngine:
             self._end_of_all()
         deadline = time.monotonic() + CONFIRMED_S
         return [*filter(None, (wait(max(0.0, deadline - time.monotonic())) for wait in waits))]
+
+    def _tell_unwritten(self, event: Halt | Pause, error: CatalogError) -> CatalogError:
+        """Tell what runs to stop or to pause, although the disk has refused to write that. The caller has the lock.
+
+        Return the error for the caller.
+        """
+        is_first = self._unwritten is None
+        if not isinstance(self._unwritten, Halt):
+            self._unwritten = event
+        word = _word_of(self._unwritten or event)
+        for name, node in _live(self._run):
+            self._runner.tell_run(node.actor, self._key(name, node), word, self._run.steps + 1)
+        if is_first:
+            self._in_thread(f"{word} later", self._insist_unwritten)
+        text = f"{error}; its actions are told to {word}, and the graph goes on if a crash comes before there is room"
+        return CatalogError(text, **error.details)
+
+    def _write_unwritten(self) -> None:
+        """Write what was told before it was written. The caller has the lock.
+
+        Raises:
+            CatalogError: there is no room yet.
+        """
+        event = self._unwritten
+        if event is None:
+            return
+        run, effects = decide(self._graph, self._run, event)
+        if run is not self._run:
+            self._commit(self._graph, run, event)
+            self._run = run
+        self._unwritten = None
+        for effect in effects:
+            self._carry_out(self._graph, effect, run.node(effect.node), run.steps)
+        if run.state in ENDED:
+            self._in_thread("end", self._end_later)
+
+    def _end_later(self, name: str) -> None:
+        self._end_of_all()
+
+    def _insist_unwritten(self, name: str) -> None:
+        """Write what was told before it was written, as soon as there is room."""
+        while self._unwritten is not None:
+            try:
+                with self._changing:
+                    if self._closed:
+                        return
+                    self._write_unwritten()
+            except CatalogError as error:
+                logger.warning("%s: waits until it can be written: %s", self._graph.name, error)
+                time.sleep(_NO_ROOM_S)
 
     def _insist(self, event: Event, query: Query | None = None) -> None:
         """Tell an event that has happened already. While the disk refuses it, try again: nobody else tells it.
@@ -468,6 +530,10 @@ class GraphEngine:
 def _live(run: GraphRun) -> list[tuple[str, NodeRun]]:
     """Return the actions that run, with those that leave."""
     return [(name, node) for some in (run.nodes, run.leaving) for name, node in some.items() if node.state in LIVE]
+
+
+def _word_of(event: Halt | Pause) -> Word:
+    return "stop" if isinstance(event, Halt) else "pause"
 
 
 def _confirmed(within_s: float) -> str:

@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 
 from rr_actors.actors.actor_tables import TableColumn, table
-from rr_actors.base.errors import LoadFailed, NotFound, OverCapacity, UnknownQuery, UsageError, shown, text_of
+from rr_actors.base.errors import LoadFailed, NotFound, OverCapacity, UnknownQuery, UsageError, is_a, shown, text_of
 from rr_actors.base.names import made_at
 from rr_actors.base.reporting.log import Log
 from rr_actors.managers.budgets.books import Book, Books, most_of
@@ -48,6 +48,7 @@ _HOLDS_S = 1.0  # a share that has waited for so long is passed over by nobody w
 _SAYS_S = 1.0  # those who are far behind hear so often that those ahead have changed
 _NEAR = 10  # the first ones hear at once
 _LOOKED_S = 30.0
+_RECORD_S = 1.0  # how soon what was set, and the disk has refused, is written again
 _TOO_MUCH = "there is too much"
 _CAPACITY = "pool %s: its probe %s; the capacity stays %g"
 
@@ -144,7 +145,8 @@ class Budgets(Manager):
 
         With a measure it is the most that the pool has.
 
-        If that is less than what is held, a reserve is started, or the lowest priorities are revoked.
+        If that is less than what is held, a reserve is started, or the lowest priorities are revoked. If the disk
+        refuses it, it holds all the same, and is written when there is room; a crash before that forgets it.
 
         Raises:
             NotFound: there is no such pool. `.id`, `.known`
@@ -216,7 +218,7 @@ class Budgets(Manager):
         return request.amount
 
     def _pool(self, name: str) -> Pool:
-        if name not in self._pools:
+        if not is_a(name, str) or name not in self._pools:
             known = tuple(sorted(self._pools))
             text = f"no pool {shown(name)}: expected one of {', '.join(known) or 'none'}"
             raise NotFound(text, id=name, known=known)
@@ -274,8 +276,11 @@ class Budgets(Manager):
             self._info(books, name, sum(one.id in self._waiting for one in waiting[name])) for name in self._pools
         ]
         self._who = {name: self._shares(books, name, waiting[name]) for name in self._pools}
+        retry_at = None if self._record.catch_up() else now + _RECORD_S
         later = [
-            at for at in (*due, self._reserves.due(now), self._refused.next_at(now)) if at is not None and at > now
+            at
+            for at in (retry_at, *due, self._reserves.due(now), self._refused.next_at(now))
+            if at is not None and at > now
         ]
         return min(later, default=None)
 

@@ -67,7 +67,7 @@ class Gauge:
     def _ask(self) -> None:
         try:
             reading: object = self._probe()
-        except (Exception, SystemExit) as error:  # a user's function may raise anything
+        except BaseException as error:  # a user's function may raise anything
             self._answers.put(f"raised {text_of(error)}")
             return
         self._answers.put(float(reading) if is_number(reading) else f"returned {shown(reading)}, not a finite number")

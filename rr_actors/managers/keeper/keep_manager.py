@@ -142,7 +142,7 @@ class Keeper(Manager):
         """Keep what another TOML file wants instead, also after a restart, until a start finds the first file changed.
 
         Return a line for each change, when the steps that follow from it have begun: "~ camera: replicas 3 -> 1".
-        Another line says so if the disk does not take it: then it holds until the next restart.
+        Another line says so if the disk does not take it: it is written when there is room.
 
         Raises:
             ConfigError: the file cannot be read, or is wrong. Nothing has changed.
@@ -200,7 +200,7 @@ class Keeper(Manager):
         made = changes(before, self._desired)
         self._loop.tell(self._failures.clear)  # what failed is tried again at once
         self._loop.look_and_wait(_APPLY_S)
-        return made if is_kept else [*made, "! this is not on disk: a restart would not know of it"]
+        return made if is_kept else [*made, "! this is not on disk yet: a restart now would not know of it"]
 
     def _differences(self) -> list[str]:
         behind = [one for one in self._newest_reports().values() if one.why]
@@ -275,7 +275,8 @@ class Keeper(Manager):
         times = [time_ for time_ in (steps.next_at, read_at) if time_ is not None]
         if any(info.server == "kept" and info.phase is Phase.LOADING for info in infos):
             times.append(now + _SOON_S)
-        is_behind = self._is_full or bool(steps.release) or any(one.why for one in reports.values())
+        is_kept = self._configuration.catch_up() and self._scaler.catch_up()
+        is_behind = self._is_full or not is_kept or bool(steps.release) or any(one.why for one in reports.values())
         if steps.next_at is not None or is_behind or any(isinstance(key, str) for key in self._loop.in_flight):
             times.append(now + _LOOK_S)
         return min(times, default=None)

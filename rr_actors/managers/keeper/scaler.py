@@ -167,12 +167,16 @@ class Scaler:
             self._record.now = KeptScales(scales)
             self._record.save()
 
+    def catch_up(self) -> bool:
+        """Write the numbers, if the disk has refused that. Return whether they are on disk."""
+        return self._record is None or self._record.catch_up()
+
 
 def _probed(on: ScaleOn, count: int) -> Reading:
     """Ask the probe. In a thread of its own."""
     try:
         value: object = probe_of(on.probe)()
-    except (Exception, SystemExit) as error:  # a user's function may raise anything
+    except BaseException as error:  # a user's function may raise anything
         raise NoReading(f"{on.label} raised {text_of(error)}") from error
     if not is_number(value):
         raise NoReading(f"{on.label} returned {shown(value)}, not a finite number")

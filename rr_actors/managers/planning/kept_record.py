@@ -56,3 +56,10 @@ class KeptRecord(Generic[R]):
                 logger.info("%s is on disk again", self._path)
             self._is_behind = False
             return True
+
+    def catch_up(self) -> bool:
+        """Write the struct if the disk has refused the last save(). Return whether it is on disk as it is now.
+
+        What somebody has set is not made again by the next event: have the planning loop call this until it is True.
+        """
+        return not self._is_behind or self.save()

@@ -62,12 +62,13 @@ class LastGood(Generic[C]):
             ConfigError, GraphError: the files cannot be read, or are wrong.
         """
         self._parse = parse
+        self._record: KeptRecord[_Record] | None = None
         self.problem = ""
         if beginning is None:
             self.now = parse(read())
             return
-        self._record = KeptRecord(beginning.directory / "configuration.json", _Record)
-        kept = self._record.now
+        record = self._record = KeptRecord(beginning.directory / "configuration.json", _Record)
+        kept = record.now
         if kept.given is not None and kept.run == beginning.run and not beginning.by_hand:
             try:
                 self.now = parse(_bytes_of(kept.applied or kept.given))
@@ -77,7 +78,7 @@ class LastGood(Generic[C]):
                 beginning.note(self._go_on(beginning.name, read, kept.given))
                 return
         beginning.note("")
-        self._begin(beginning, read, kept)
+        self._begin(beginning, read, record)
 
     def _go_on(self, name: str, read: Callable[[], Sources], given: Mapping[str, str]) -> str:
         """Return what an operator should know."""
@@ -88,8 +89,8 @@ class LastGood(Generic[C]):
             return said
         return ""
 
-    def _begin(self, beginning: Beginning, read: Callable[[], Sources], kept: _Record) -> None:
-        sources = read()
+    def _begin(self, beginning: Beginning, read: Callable[[], Sources], record: KeptRecord[_Record]) -> None:
+        sources, kept = read(), record.now
         self.now = self._parse(sources)
         given = _texts_of(sources)
         applied = kept.applied if kept.given == given else None
@@ -99,8 +100,8 @@ class LastGood(Generic[C]):
             except (ConfigError, GraphError) as error:  # another version has applied it
                 logger.warning("%s: what was applied does not hold any more: %s", beginning.name, error)
                 applied = None
-        self._record.now = _Record(beginning.run, given, applied)
-        self._record.save()
+        record.now = _Record(beginning.run, given, applied)
+        record.save()
 
     def apply(self, sources: Sources) -> bool:
         """Let other contents hold in place of the files, until the files say something else at a start.
@@ -112,9 +113,15 @@ class LastGood(Generic[C]):
         """
         self.now = self._parse(sources)
         applied = _texts_of(sources)
+        if self._record is None:
+            return True
         kept = self._record.now
         self._record.now = _Record(kept.run, kept.given, applied)
         return self._record.save()
+
+    def catch_up(self) -> bool:
+        """Write what was applied, if the disk has refused that. Return whether it is on disk."""
+        return self._record is None or self._record.catch_up()
 
     def _difference(self, read: Callable[[], Sources], given: Mapping[str, str]) -> str:
         """Return how what the files say now differs from what they said; "" if it does not."""

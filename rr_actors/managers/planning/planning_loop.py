@@ -164,7 +164,7 @@ class PlanningLoop(Generic[K, W]):
                 outcome = StepEnded(call())
             except RrError as error:
                 outcome = StepEnded(error=error)
-            except Exception as error:
+            except BaseException as error:  # also what is no Exception: the step would be in flight for ever
                 self._happened.put(functools.partial(_raise, error))
                 return
             self._happened.put(lambda: self._end(key, ended, outcome))
@@ -269,7 +269,7 @@ def _nothing() -> None:
     """Do nothing: to wake the loop is enough."""
 
 
-def _raise(error: Exception) -> None:
+def _raise(error: BaseException) -> None:
     raise error
 
 
