@@ -265,7 +265,7 @@ class StreamReader:
         was, self._is_unbound = self._is_unbound, True  # also if a signal handler raises meanwhile
         if not self._wake.take() and not was:
             self._is_unbound = False
-        if self._is_unbound:
+        if self._is_unbound or self._stream is None:  # of a resource that has no stream yet nobody is told when it has
             self._bind()
             self._is_unbound = False
 
@@ -343,7 +343,7 @@ class StreamReader:
         resource_id = own if self._stream is None else self._stream.resource_id
         known = known_streams(resource_id)
         name = None if self._stream is None else self._stream.name
-        if name in known:
+        if name in known or (name is None and any(known.values())):  # one was opened after the look: the next finds it
             return
         # It asks after it has looked: a manager that runs then, and has run since the load, ran at the look, too.
         if any(known.values()) or apart_s > _OPENS_S or (resource_id == own and self._source.has_all()):

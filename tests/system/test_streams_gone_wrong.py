@@ -52,6 +52,10 @@ class Boards(rr.Manager):
     def open_once(self) -> None:
         self.streams["once"] = rr.current().open_stream("once")
 
+    @rr.server("plain", recovery="reload")
+    def open_plain(self) -> None:
+        self.streams["plain"] = rr.current().open_stream("plain")
+
     def on_receive(self, message: Any) -> None:
         raise RuntimeError(message)
 
@@ -683,12 +687,19 @@ def test_a_stream_is_waited_for_while_its_manager_in_a_thread_crashes(start: Sta
         reads_on(boards, board.stream("a", timeout_s=30))
 
 
-def reads_on(boards: Any, reader: rr.StreamReader) -> None:
+def test_the_only_stream_of_a_crashed_manager_needs_no_name(system: rr.System, boards: Any) -> None:
+    with system.open_registrar("app").load(Boards.open_plain) as plain:
+        kill(system, "boards")
+        eventually(lambda: known_streams(plain.resource_id) == {})
+        reads_on(boards, plain.stream(timeout_s=30), "plain")
+
+
+def reads_on(boards: Any, reader: rr.StreamReader, name: str = "a") -> None:
     """Check that the reader gets what is published when it has come."""
 
     def publish() -> None:
-        when_wanted(boards)
-        boards.publish("a", "again").get()
+        when_wanted(boards, name)
+        boards.publish(name, "again").get()
 
     publishing = threading.Thread(target=publish)
     publishing.start()
