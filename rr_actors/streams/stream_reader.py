@@ -6,6 +6,7 @@ import asyncio
 import os
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterable
 from typing import NamedTuple, NoReturn, Self
 
@@ -108,7 +109,7 @@ class StreamReader:
         self._is_told = False  # that it is closed
         self._looking = threading.Lock()  # for short: no thread waits with it
         self._thread = 0  # the thread that has it
-        self._turns = asyncio.Lock()
+        self._turns: weakref.WeakKeyDictionary[asyncio.AbstractEventLoop, asyncio.Lock] = weakref.WeakKeyDictionary()
         try:
             self._wake = Wake()
         except OSError as error:
@@ -153,7 +154,7 @@ class StreamReader:
 
     async def __anext__(self) -> StreamFrame:
         wake = self._begin()
-        async with self._turns:
+        async with self._turns.setdefault(asyncio.get_running_loop(), asyncio.Lock()):  # a loop waits for a socket once
             began = time.monotonic()
             try:
                 found = self._look(began, is_first=True)

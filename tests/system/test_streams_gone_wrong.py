@@ -314,6 +314,31 @@ def test_tasks_that_wait_for_quiet_streams_hold_no_thread(system: rr.System, boa
     assert asyncio.run(asyncio.wait_for(read_busy(), 20)) == ("frame", "ran")
 
 
+def test_tasks_of_several_loops_read_one_stream(system: rr.System, boards: Any) -> None:
+    with load(system, "a").stream("a", keep="all", timeout_s=20) as reader:
+        when_wanted(boards)
+        numbers: list[int] = []
+
+        async def read() -> None:
+            while True:
+                numbers.append((await anext(reader)).number)
+
+        def run() -> None:
+            with pytest.raises(StopAsyncIteration):
+                asyncio.run(read())
+
+        threads = [threading.Thread(target=run, daemon=True) for _ in range(3)]
+        for thread in threads:
+            thread.start()
+        for _ in range(20):
+            boards.publish("a", *range(10)).get(timeout=20)
+        eventually(lambda: len(numbers) == 200)
+    for thread in threads:
+        thread.join(20)
+        assert not thread.is_alive()
+    assert sorted(numbers) == [*range(1, 201)]
+
+
 def test_a_cancelled_task_loses_no_frame(system: rr.System, boards: Any) -> None:
     numbers: list[int] = []
     with load(system, "a").stream("a", keep="all", depth=50) as reader:
