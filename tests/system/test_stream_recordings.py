@@ -294,7 +294,7 @@ def test_a_file_that_is_gone_at_a_crash_ends_nothing_but_its_own_resource(
     assert eventually(lambda: gone.state is rr.State.FATAL)
     assert frames_of(here, 3)
     assert "cameras goes on without what it cannot read:" in caplog.text
-    with pytest.raises(rr.LoadFailed, match=r'expected one of "front"; .*rear\.frames: expected the file of a recorded'):
+    with pytest.raises(rr.LoadFailed, match=r'expected one of "front"; .*rear\.frames: expected the file'):
         consumer.load("cameras/camera", "rear")
     system.supervisor().terminate_child("cameras")
     with pytest.raises(rr.StartFailed, match=r"rear\.frames"):

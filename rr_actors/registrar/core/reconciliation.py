@@ -108,8 +108,8 @@ def _take_back(decision: Decision, registrar: str, query: FetchedQuery) -> None:
     cases. It has no response: then its load was never acknowledged. It is of an earlier attempt of its parent: the
     parent does not have it any more. It is of this incarnation: then we have released it, as otherwise we would have
     its row. This registrar was closed since: that releases what a provider has that was away then, except for the parts
-    of a resource that could not be unloaded. This registrar is a client's, which begins anew in each run of the system: a
-    client that reconnects loads what it still wants.
+    of a resource that could not be unloaded. This registrar is a client's, which begins anew in each run of the
+    system: a client that reconnects loads what it still wants.
     """
     catalog = decision.catalog
     peer = catalog.peers.get(registrar)
