@@ -15,7 +15,7 @@ from rr_actors.actors.refs import ref_in
 from rr_actors.base.errors import RrError, Unavailable, UsageError, shown
 from rr_actors.base.reporting.log import Log
 from rr_actors.runtime.event_loop import acquire, release
-from rr_actors.runtime.time_limits import time_limit
+from rr_actors.runtime.time_limits import finite_time
 
 logger = Log("rr_actors")
 
@@ -98,11 +98,9 @@ def send_after(delay_s: float, ref: Any, message: Any) -> Timer:
         ref: a reference or a proxy, to an actor in any process of the system.
 
     Raises:
-        UsageError: `ref` is no reference, or delay_s is no number of seconds.
+        UsageError: `ref` is no reference, or `delay_s` no number of seconds, from 0 to 1,999,999.
     """
-    limit_s = time_limit(delay_s, "send_after: delay_s")
-    target = ref_in(ref)
-    if limit_s is None or target is None:
-        expected = "a reference to an actor" if limit_s is not None else "seconds, fewer than 2 million,"
-        raise UsageError(f"send_after: expected {expected}, got {shown(delay_s if limit_s is None else ref)}")
-    return Timer(limit_s, target, message)
+    seconds = finite_time(delay_s, "send_after: delay_s")
+    if (target := ref_in(ref)) is None:
+        raise UsageError(f"send_after: expected a reference to an actor, got {shown(ref)}")
+    return Timer(seconds, target, message)

@@ -11,13 +11,17 @@ import os
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
-from rr_actors.base.checks import is_number
+import msgspec
+
+from rr_actors.base.checks import is_number, path_text
 from rr_actors.base.errors import ConfigError, NotFound, UsageError, few, shown, text_of
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.canonical import encode, json_of, shown_plain
-from rr_actors.registrar.manager import Manager
+from rr_actors.managers.planning.kept_record import KeptRecord
+from rr_actors.registrar.manager import Beginning, Manager
 from rr_actors.registrar.servers.callback_context import current
 from rr_actors.streams.publisher import Publisher
 from rr_actors.streams.stream_file import RecordedStream, header_of
@@ -62,12 +66,22 @@ class Schedule(Generic[P]):
             start_s += round_s
 
 
+class _Served(msgspec.Struct):
+    """The run of the system that has read the files, and the server of each."""
+
+    run: str = ""
+    servers: dict[str, str] = {}
+
+
 class Replays(Manager):
     """Serves recorded streams: publishes their frames in the times in which they were recorded.
 
     It has the servers that the files name, each for the requests that the files have. The response is that of the
     recorded resource as plain data; what names its streams names those of the replay. All streams of a resource begin
     when it is loaded, and each resource that is loaded anew begins anew.
+
+    If a file is gone or damaged when the supervisor restarts the manager, the others are served, and the log has a
+    WARNING. Who holds a resource of that file hears FATAL.
     """
 
     _side_by_side = True
@@ -92,14 +106,53 @@ class Replays(Manager):
         if not isinstance(files, list | tuple) or not files:
             raise UsageError(f"Replays: files: expected a list of files, got {shown(cast('object', files))}")
         self._servers: dict[str, _Server] = {}
-        for file in files:
-            self._add(RecordedStream(file), float(speed), loops=loop)
+        self._speed, self._loops = float(speed), loop
+        beginning = self._beginning()
+        if beginning is None:
+            self._read_files(files, {})
+        else:
+            self._begin_with(beginning, files)
 
-    def _add(self, recorded: RecordedStream, speed: float, *, loops: bool) -> None:
+    def _begin_with(self, beginning: Beginning, files: Sequence[str | os.PathLike[str]]) -> None:
+        record = KeptRecord(beginning.directory / "replays.json", _Served)
+        is_restart = record.now.run == beginning.run and not beginning.by_hand
+        servers, problems = self._read_files(files, record.now.servers if is_restart else {})
+        said = f"goes on without what it cannot read: {'; '.join(problems)}" if problems else ""
+        if said:
+            logger.warning("%s %s", beginning.name, said)
+        beginning.note(said)
+        if not is_restart:
+            record.now = _Served(beginning.run, servers)
+            record.save()
+
+    def _read_files(
+        self, files: Sequence[str | os.PathLike[str]], before: Mapping[str, str]
+    ) -> tuple[dict[str, str], list[str]]:
+        """Read the files; return the server of each, and what is wrong with those that were right `before`."""
+        servers: dict[str, str] = {}
+        problems: list[str] = []
+        for file in files:
+            path = str(Path(path_text(file)).absolute())
+            try:
+                servers[path] = self._add(RecordedStream(file))
+            except ConfigError as error:
+                if path not in before:
+                    raise
+                self._server(before[path]).unread.append(str(error))
+                problems.append(str(error))
+        return servers, problems
+
+    def _add(self, recorded: RecordedStream) -> str:
         if not recorded.frames:
             raise _wrong(recorded, "a recorded stream with a frame", "none")
         name = recorded.server.rpartition("/")[2]
-        self._servers.setdefault(name, _Server(name, speed, loops=loops)).add(recorded)
+        self._server(name).add(recorded)
+        return name
+
+    def _server(self, name: str) -> _Server:
+        if name not in self._servers:
+            self._servers[name] = _Server(name, self._speed, loops=self._loops)
+        return self._servers[name]
 
     def on_start(self) -> None:
         """Serve what the files name."""
@@ -113,12 +166,17 @@ class Replays(Manager):
 
 
 class _Server:
-    """A server of recorded resources."""
+    """A server of recorded resources.
+
+    Attributes:
+        unread: why files of this server cannot be read any more.
+    """
 
     def __init__(self, name: str, speed: float, *, loops: bool) -> None:
         self._name, self._speed, self._loops = name, speed, loops
         self._streams: dict[bytes | None, dict[str, RecordedStream]] = {}  # by the request; None: by any
         self._stops: dict[str, threading.Event] = {}  # of the replays that run, by resource
+        self.unread: list[str] = []
 
     def add(self, recorded: RecordedStream) -> None:
         """Serve a recorded stream, too."""
@@ -135,7 +193,8 @@ class _Server:
         if streams is None:
             known = [json_of(shown_plain(raw)) for raw in self._streams if raw is not None]
             text = f"server {self._name!r}: nothing is recorded for the request {json_of(shown_plain(asked))}"
-            raise NotFound(f"{text}; expected one of {few(known)}", id=self._name, known=tuple(known))
+            text = "; ".join([f"{text}; expected one of {few(known) or 'none'}", *self.unread])
+            raise NotFound(text, id=self._name, known=tuple(known))
         me = current()
         publishers = {stream: me.open_stream(stream) for stream in streams}
         stop = self._stops[me.resource_id] = threading.Event()

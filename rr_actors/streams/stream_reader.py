@@ -6,6 +6,7 @@ import asyncio
 import os
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterable
 from typing import NamedTuple, NoReturn, Self
 
@@ -108,7 +109,7 @@ class StreamReader:
         self._is_told = False  # that it is closed
         self._looking = threading.Lock()  # for short: no thread waits with it
         self._thread = 0  # the thread that has it
-        self._turns = asyncio.Lock()
+        self._turns: weakref.WeakKeyDictionary[asyncio.AbstractEventLoop, asyncio.Lock] = weakref.WeakKeyDictionary()
         try:
             self._wake = Wake()
         except OSError as error:
@@ -153,7 +154,7 @@ class StreamReader:
 
     async def __anext__(self) -> StreamFrame:
         wake = self._begin()
-        async with self._turns:
+        async with self._turns.setdefault(asyncio.get_running_loop(), asyncio.Lock()):  # a loop waits for a socket once
             began = time.monotonic()
             try:
                 found = self._look(began, is_first=True)
@@ -265,7 +266,7 @@ class StreamReader:
         was, self._is_unbound = self._is_unbound, True  # also if a signal handler raises meanwhile
         if not self._wake.take() and not was:
             self._is_unbound = False
-        if self._is_unbound:
+        if self._is_unbound or self._stream is None:  # of a resource that has no stream yet nobody is told when it has
             self._bind()
             self._is_unbound = False
 
@@ -343,7 +344,7 @@ class StreamReader:
         resource_id = own if self._stream is None else self._stream.resource_id
         known = known_streams(resource_id)
         name = None if self._stream is None else self._stream.name
-        if name in known:
+        if name in known or (name is None and any(known.values())):  # one was opened after the look: the next finds it
             return
         # It asks after it has looked: a manager that runs then, and has run since the load, ran at the look, too.
         if any(known.values()) or apart_s > _OPENS_S or (resource_id == own and self._source.has_all()):

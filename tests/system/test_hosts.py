@@ -386,12 +386,16 @@ def test_of_two_systems_with_one_name_the_second_is_refused_until_the_first_has_
         wait_up(first, "hostb/cameras")
         first.open_registrar("app").load("hostb/cameras/camera", "front", timeout_s=LIMIT_S)
         with named_a("second") as second:
-            until(lambda: any(info.state == "refused" for info in second.hosts()), "the second is refused", LIMIT_S)
             app = second.open_registrar("app")
+            until(lambda: bool(second.hosts()), "the second knows hostb", LIMIT_S)
+            waiting = app.load("hostb/cameras/camera", "rear", timeout_s=8.0, block=False)
+            until(lambda: any(info.state == "refused" for info in second.hosts()), "the second is refused", LIMIT_S)
             refused = r"a system in process \d+ of \S+ is host 'hosta' of group 'rr' already, so 'hostb' refuses"
             with pytest.raises(rr.NameTaken, match=refused) as raised:
                 app.load("hostb/cameras/camera", "front")
             assert raised.value.name == "hosta"
+            with pytest.raises(rr.LoadTimeout, match=refused):
+                waiting.get()
             seen = r"a system in process \d+ of \S+ has its name, too, and is refused"
             until(functools.partial(says, b, seen), "hostb says so", LIMIT_S)
             assert is_up(b, "hosta")

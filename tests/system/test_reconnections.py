@@ -202,25 +202,38 @@ def test_a_connection_that_is_closed_while_no_system_runs_waits_for_none(
 PROGRAM = """
 import sys
 import rr_actors as rr
+class Gate(rr.Actor):
+    def on_start(self):
+        sys.stdin.readline()
 class Lamps(rr.Manager):
     @rr.server("lamp", recovery="keep")
     def switch_on(self, name: str) -> str:
         return name
-with rr.System([rr.ChildSpec(Lamps, id="lamps", placement="thread")], state_dir=sys.argv[1]) as system:
+    @rr.server("key", recovery="keep", exclusive=True)
+    def turn(self, name: str) -> str:
+        return name
+children = [rr.ChildSpec(one, id=one.__name__.lower(), placement="thread") for one in (Gate, Lamps)]
+with rr.System(children, state_dir=sys.argv[1]) as system:
     print("runs", flush=True)
     system.run()
 """
 
 
 @pytest.fixture
-def run(state_dir: Path) -> Iterator[Callable[[], int]]:
+def run(state_dir: Path) -> Iterator[Callable[..., int]]:
     started: list[subprocess.Popen[str]] = []
 
-    def run() -> int:
-        command = [sys.executable, "-c", PROGRAM]
-        started.append(subprocess.Popen([*command, str(state_dir)], stdout=subprocess.PIPE, text=True))
-        assert started[-1].stdout is not None
-        assert started[-1].stdout.readline() == "runs\n"
+    def run(before: Callable[[], object] = lambda: None) -> int:
+        """Start the system; its manager when `before` has returned."""
+        command = [sys.executable, "-c", PROGRAM, str(state_dir)]
+        started.append(subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True))
+        stdin, stdout = started[-1].stdin, started[-1].stdout
+        assert stdin is not None
+        assert stdout is not None
+        before()
+        stdin.write("\n")
+        stdin.flush()
+        assert stdout.readline() == "runs\n"
         return started[-1].pid
 
     yield run
@@ -243,3 +256,36 @@ def test_a_system_that_was_killed_is_waited_for_too(run: Callable[[], int], stat
         assert told(heard, 2)[1] == ("OK", "reconnected")
         assert connection.pid == again
         assert lamp.fetch_state() == "OK"
+
+
+def test_what_a_killed_system_held_for_a_connected_program_is_not_held_twice(run: Callable[..., int], state_dir: Path) -> None:
+    """The client is back before the managers that have the queries of its time before."""
+    killed = run()
+    with rr.connect(state_dir, reconnect=True) as client, client.open_registrar("w") as worker:
+        red, blue = (worker.load("lamps/lamp", name) for name in ("red", "blue"))
+        key = worker.load("lamps/key", "door")
+        os.kill(killed, signal.SIGKILL)
+        eventually(lambda: key.state is rr.State.ERROR)
+        blue.unload()
+
+        def is_back() -> bool:
+            try:
+                return len(worker.queries()) == 2
+            except rr.NotRunning:
+                return False
+
+        def held() -> list[tuple[str, str]]:
+            return sorted((row.request, row.hold) for row in worker.queries())
+
+        def when_back() -> None:
+            eventually(is_back)
+            for query in (red, key):
+                with pytest.raises(rr.Unavailable, match="it is being loaded again"):
+                    query.fetch_state()
+
+        run(when_back)
+        eventually(lambda: (red.state, key.state) == (rr.State.OK, rr.State.OK))
+        eventually(lambda: held() == [('"door"', "held"), ('"red"', "held")])
+        red.unload()
+        key.unload()
+        eventually(lambda: held() == [])

@@ -287,6 +287,27 @@ def test_a_reader_goes_on_when_a_replay_was_killed(start: Start, front: Path) ->
     assert eventually(lambda: not system.streams())
 
 
+def test_a_file_that_is_gone_at_a_crash_ends_nothing_but_its_own_resource(
+    start: Start, app: rr.Registrar, front: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    rear = tmp_path / "rear.frames"
+    with app.load(Cameras.open_camera, "rear") as camera, rr.record_stream(camera, rear) as recording:
+        assert eventually(lambda: recording.frames >= 3)
+    system = start(rr.ChildSpec(Replays, id="cameras", args=([front, rear],)), state_dir=tmp_path / "other")
+    consumer = system.open_registrar("app")
+    here, gone = (consumer.load("cameras/camera", device) for device in ("front", "rear"))
+    rear.unlink()
+    wait_respawned(system, "cameras", kill(system, "cameras"))
+    assert eventually(lambda: gone.state is rr.State.FATAL)
+    assert frames_of(here, 3)
+    assert "cameras goes on without what it cannot read:" in caplog.text
+    with pytest.raises(rr.LoadFailed, match=r'expected one of "front"; .*rear\.frames: expected the file'):
+        consumer.load("cameras/camera", "rear")
+    system.supervisor().terminate_child("cameras")
+    with pytest.raises(rr.StartFailed, match=r"rear\.frames"):
+        system.supervisor().restart_child("cameras")
+
+
 def test_what_is_wrong_with_a_replay_is_named(tmp_path: Path) -> None:
     file, empty = write(tmp_path / "f", 1, 2), write(tmp_path / "empty")
     for arguments, said in (

@@ -52,6 +52,10 @@ class Boards(rr.Manager):
     def open_once(self) -> None:
         self.streams["once"] = rr.current().open_stream("once")
 
+    @rr.server("plain", recovery="reload")
+    def open_plain(self) -> None:
+        self.streams["plain"] = rr.current().open_stream("plain")
+
     def on_receive(self, message: Any) -> None:
         raise RuntimeError(message)
 
@@ -308,6 +312,31 @@ def test_tasks_that_wait_for_quiet_streams_hold_no_thread(system: rr.System, boa
         return arriving.result().value, await asyncio.to_thread(lambda: "ran")
 
     assert asyncio.run(asyncio.wait_for(read_busy(), 20)) == ("frame", "ran")
+
+
+def test_tasks_of_several_loops_read_one_stream(system: rr.System, boards: Any) -> None:
+    with load(system, "a").stream("a", keep="all", timeout_s=20) as reader:
+        when_wanted(boards)
+        numbers: list[int] = []
+
+        async def read() -> None:
+            while True:
+                numbers.append((await anext(reader)).number)
+
+        def run() -> None:
+            with pytest.raises(StopAsyncIteration):
+                asyncio.run(read())
+
+        threads = [threading.Thread(target=run, daemon=True) for _ in range(3)]
+        for thread in threads:
+            thread.start()
+        for _ in range(20):
+            boards.publish("a", *range(10)).get(timeout=20)
+        eventually(lambda: len(numbers) == 200)
+    for thread in threads:
+        thread.join(20)
+        assert not thread.is_alive()
+    assert sorted(numbers) == [*range(1, 201)]
 
 
 def test_a_cancelled_task_loses_no_frame(system: rr.System, boards: Any) -> None:
@@ -683,12 +712,19 @@ def test_a_stream_is_waited_for_while_its_manager_in_a_thread_crashes(start: Sta
         reads_on(boards, board.stream("a", timeout_s=30))
 
 
-def reads_on(boards: Any, reader: rr.StreamReader) -> None:
+def test_the_only_stream_of_a_crashed_manager_needs_no_name(system: rr.System, boards: Any) -> None:
+    with system.open_registrar("app").load(Boards.open_plain) as plain:
+        kill(system, "boards")
+        eventually(lambda: known_streams(plain.resource_id) == {})
+        reads_on(boards, plain.stream(timeout_s=30), "plain")
+
+
+def reads_on(boards: Any, reader: rr.StreamReader, name: str = "a") -> None:
     """Check that the reader gets what is published when it has come."""
 
     def publish() -> None:
-        when_wanted(boards)
-        boards.publish("a", "again").get()
+        when_wanted(boards, name)
+        boards.publish(name, "again").get()
 
     publishing = threading.Thread(target=publish)
     publishing.start()

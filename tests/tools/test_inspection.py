@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rr_actors.registrar.model.rows import Held, Hold, Notice, Peer, Phase, Resource, Row, ServedQuery, State
-from rr_actors.tools.inspection import Contents, check
+from rr_actors.tools.inspection import Contents, check, check_delivered
 from support_steps import steps_of
 
 EMPTY = b"\xc0"
@@ -56,3 +56,17 @@ def test_a_look_takes_as_many_steps_for_each_of_many_resources_as_of_few(
         return steps_of(lambda: look(state))[0] / count
 
     assert each(1_000) <= each(100) * 1.1
+
+
+def test_queries_of_other_hosts_are_not_compared() -> None:
+    state = state_of(1)
+    shop = state["shop"]
+    rows: list[Row] = [*shop.resources.values(), *shop.held.values(), *shop.queries.values()]
+    rows += [ServedQuery("far", "r0", "hostb/app", "", 1, 1), Peer("hostb/parts")]
+    rows.append(Notice("told", "far", "hostb/app", "r0", "e1", State.ERROR, "dark", "r0"))
+    for id, hold in (("lens", Hold.HELD), ("cap", Hold.OWED)):
+        rows.append(Held(id, "hostb/parts", "wheel", EMPTY, EMPTY, "x9", "r0", 1, 9, hold, State.OK))
+    state["shop"] = Contents("shop", Path("shop"), rows)
+    state["app"].held.pop("gone0")
+    assert check(state) == []
+    assert list(check_delivered(state)) == []

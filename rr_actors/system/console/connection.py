@@ -434,7 +434,7 @@ class ConnectedRegistrar(Consumer):
         Raises:
             UnknownQuery: the query is not held any more.
             NotRunning: the system has ended.
-            Unavailable: the registrar does not answer.
+            Unavailable: the registrar does not answer, or the system's next run does not hold the query yet.
         """
         return State(self._row(target_id(query_or_id)).state)
 
@@ -459,6 +459,8 @@ class ConnectedRegistrar(Consumer):
 
     def _row(self, id: str) -> QueryRow:
         self._lifeline.check_here()
+        if self._views.is_away(id):
+            raise Unavailable(f"query {id}: it is being loaded again, as the system has been started again")
         held_as = self._views.held_as(id)
         found = self._connections.ask(Find(held_as, self.name))
         for row in found.queries:

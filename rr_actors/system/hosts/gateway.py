@@ -232,11 +232,11 @@ class _Run:
             try:
                 await self._network.connect(peer.name, Hello(_HOSTS, peer.name, self._name, 0), hearing.attach)
             except ProtocolMismatch as error:
-                self._set_row(peer, REFUSED, str(error))
+                self._refused(peer, str(error))
                 return
             except NameTaken as error:
                 if asyncio.get_running_loop().time() > since + _TWIN_S:
-                    self._set_row(peer, REFUSED, str(error), name_taken=True)
+                    self._refused(peer, str(error), name_taken=True)
                 await asyncio.sleep(_AGAIN_S)
                 continue
             except RrError as error:
@@ -275,6 +275,13 @@ class _Run:
         peer.exports = {}
         for relay in [relay for relay, host in self._relays.items() if host == peer.name]:
             relay.close()
+
+    def _refused(self, peer: _Peer, why: str, *, name_taken: bool = False) -> None:
+        """Write that a host refuses this one, also for the loads that wait for it."""
+        self._set_row(peer, REFUSED, why, name_taken=name_taken)
+        for registrar in self._directory.other_hosts_registrars():
+            if registrar.startswith(f"{peer.name}/"):
+                self._directory.mark(registrar_key(registrar), Presence.STARTING, away(peer.name, peer.row))
 
     async def _look(self) -> None:
         """Write of each host that is away where it has been looked for, while that goes on."""
