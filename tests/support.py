@@ -31,7 +31,7 @@ _FOLDERS = sorted(path for path in TESTS.iterdir() if path.is_dir() and not (pat
 TEST_PATHS = os.pathsep.join(map(str, [REPOSITORY, TESTS, *_FOLDERS]))
 T = TypeVar("T")
 BROWSERS: set[int] = set()
-"""Browsers that serve all tests of a module. They start and end processes of their own as they like."""
+"""Browsers that serve all tests of this process. They start and end processes of their own as they like."""
 WARM: set[int] = set()
 """The processes that fork fork servers and pages for tests, children of this one (warm_servers.py)."""
 LIMIT_S = 10.0
