@@ -1,8 +1,8 @@
 """A browser for tests of web pages: Debian's Chromium, driven by Playwright from a thread of its own.
 
 One browser serves all tests of a process. A new tab takes it half a second of a processor, so a test has one that an
-earlier test has left, without what that has stored there; two tabs of a test are two persons' browsers. What a page asks
-of any other machine is noted, and fails the test.
+earlier test has left, without what that has stored there. Two tabs of a test are the browsers of two persons. What a
+page asks of any other machine is noted, and fails the test.
 """
 
 from __future__ import annotations
