@@ -148,7 +148,11 @@ def _processes() -> set[tuple[int, float]]:
         except (OSError, psutil.NoSuchProcess):
             continue
     found = {one for one in found if one[0] not in WARM}
-    return found if not BROWSERS else {one for one in found if not _is_of_a_browser(one[0])}
+    if not BROWSERS:
+        return found
+    of_browsers = {one for one in found if _is_of_a_browser(one[0])}
+    _others.update(pid for pid, _ in of_browsers)
+    return found - of_browsers
 
 
 def _is_of_a_browser(pid: int) -> bool:

@@ -31,9 +31,10 @@ _FOLDERS = sorted(path for path in TESTS.iterdir() if path.is_dir() and not (pat
 TEST_PATHS = os.pathsep.join(map(str, [REPOSITORY, TESTS, *_FOLDERS]))
 T = TypeVar("T")
 BROWSERS: set[int] = set()
-"""Browsers that serve all tests of a module. They start and end processes of their own as they like."""
+"""Browsers that serve all tests of this process. They start and end processes of their own as they like."""
 WARM: set[int] = set()
 """The processes that fork fork servers and pages for tests, children of this one (warm_servers.py)."""
+_PAUSE_S, _LONGEST_PAUSE_S = 0.003, 0.05
 LIMIT_S = 10.0
 """How long a test waits for something that is promised, before it says that it did not happen."""
 
@@ -58,17 +59,19 @@ def break_exchanges(monkeypatch: Any, error: BaseException, *, sends: bool, kind
 def eventually(predicate: Callable[[], T], timeout: float = LIMIT_S, what: str = "") -> T:
     """Return the first true value of `predicate`, asked every few milliseconds.
 
+    A predicate that takes long is asked less often: what it waits for needs a processor, too.
+
     Raises:
         AssertionError: it was not true within `timeout` seconds.
     """
-    deadline = time.monotonic() + timeout
-    while True:
-        value = predicate()
-        if value:
-            return value
-        if time.monotonic() > deadline:
+    began = asked = time.monotonic()
+    while not (value := predicate()):
+        now = time.monotonic()
+        if now > began + timeout:
             raise AssertionError(f"not within {timeout:g} s: {what or predicate}; last value {value!r}")
-        time.sleep(0.003)
+        time.sleep(min(max(_PAUSE_S, 3 * (now - asked)), _LONGEST_PAUSE_S))
+        asked = time.monotonic()
+    return value
 
 
 def lives(pid: int) -> bool:

@@ -1,7 +1,8 @@
 """A browser for tests of web pages: Debian's Chromium, driven by Playwright from a thread of its own.
 
-One browser serves all tests of a module. Each test has tabs of its own, in contexts of their own, as if each were
-another person's browser. What a page asks of any other machine is noted, and fails the test.
+One browser serves all tests of a process. A new tab takes it half a second of a processor, so a test has one that an
+earlier test has left, without what that has stored there. Two tabs of a test are the browsers of two persons. What a
+page asks of any other machine is noted, and fails the test.
 """
 
 from __future__ import annotations
@@ -19,7 +20,17 @@ from urllib.parse import urlsplit
 
 import psutil
 import pytest
-from playwright.async_api import Browser, BrowserContext, ConsoleMessage, Locator, Page, Playwright, async_playwright
+from playwright.async_api import (
+    Browser,
+    ConsoleMessage,
+    Error,
+    Locator,
+    Page,
+    Playwright,
+    Request,
+    WebSocket,
+    async_playwright,
+)
 
 from rr_actors.system import web_process
 from support import BROWSERS, LIMIT_S, REPOSITORY, eventually, wait_gone
@@ -53,6 +64,7 @@ class Chromium:
         self._playwright: Playwright | None = None
         self._browser: Browser | None = None
         self._pids: set[int] = set()
+        self._free: list[Page] = []
 
     def open(self) -> None:
         self._thread.start()
@@ -88,19 +100,26 @@ class Chromium:
     @contextmanager
     def tab(self, width: int = 1280, height: int = 800) -> Iterator[Tab]:
         """A tab in a browser of its own, which shows no page yet."""
-        tab = self.do(self._tab(width, height))
+        page = self._free.pop() if self._free else self.do(self._page())
         try:
+            tab = self.do(self._tab(page, width, height))
             yield tab
-        finally:
-            self.do(tab.context.close())
+            self.do(tab.leave())
+        except BaseException:
+            self.do(page.context.close())  # nobody knows what it shows
+            raise
+        self._free.append(page)
         assert tab.outside == []
         assert tab.errors == [], tab.errors
 
-    async def _tab(self, width: int, height: int) -> Tab:
-        """On the loop, as a part of what Playwright calls directly needs one."""
+    async def _page(self) -> Page:
         assert self._browser is not None
-        context = await self._browser.new_context(viewport={"width": width, "height": height})
-        return Tab(self, context, await context.new_page())
+        return await (await self._browser.new_context()).new_page()
+
+    async def _tab(self, page: Page, width: int, height: int) -> Tab:
+        """On the loop, as a part of what Playwright calls directly needs one."""
+        await page.set_viewport_size({"width": width, "height": height})
+        return Tab(self, page)
 
 
 class Tab:
@@ -114,19 +133,45 @@ class Tab:
             shows what the test waits for.
     """
 
-    def __init__(self, chromium: Chromium, context: BrowserContext, page: Page) -> None:
+    def __init__(self, chromium: Chromium, page: Page) -> None:
         self.page = page
-        self.context = context
+        self.context = page.context
         self.asked: list[str] = []
         self.outside: list[str] = []
         self.errors: list[str] = []
         self.expected: tuple[str, ...] = ("net::ERR_", "WebSocket")
         self._chromium = chromium
         page.set_default_timeout(PATIENCE_S * 1000)
-        context.on("request", lambda request: self._note(request.url))
-        page.on("websocket", lambda socket: self._note(socket.url))
-        page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.context.on("request", self._request)
+        page.on("websocket", self._socket)
+        page.on("pageerror", self._error)
         page.on("console", self._complaint)
+
+    async def leave(self) -> None:
+        """Leave the page, and take away what it has stored and what the test has set: the next test has the tab."""
+        await self.page.unroute_all()
+        await self.page.goto("about:blank")
+        await self.page.emulate_media(color_scheme="light")
+        await self.context.clear_permissions()
+        await self.context.clear_cookies()
+        stores = await self.context.new_cdp_session(self.page)
+        places = [parts for parts in map(urlsplit, self.asked) if parts.scheme in ("http", "file")]
+        for origin in {f"{parts.scheme}://{parts.netloc}" for parts in places}:
+            await stores.send("Storage.clearDataForOrigin", {"origin": origin, "storageTypes": "all"})
+        await stores.detach()
+        self.context.remove_listener("request", self._request)
+        self.page.remove_listener("websocket", self._socket)
+        self.page.remove_listener("pageerror", self._error)
+        self.page.remove_listener("console", self._complaint)
+
+    def _request(self, request: Request) -> None:
+        self._note(request.url)
+
+    def _socket(self, socket: WebSocket) -> None:
+        self._note(socket.url)
+
+    def _error(self, error: Error) -> None:
+        self.errors.append(str(error))
 
     def _note(self, url: str) -> None:
         self.asked.append(url)

@@ -18,6 +18,7 @@ def run_cli(*arguments: object, **environment: str) -> subprocess.CompletedProce
     out, err, code = io.StringIO(), io.StringIO(), 0
     with (
         mock.patch.object(sys, "argv", ["rr-actors", *words]),
+        mock.patch.object(sys.modules["__main__"], "__package__", None),  # else its usage names `python -m pytest`
         mock.patch.dict(os.environ, environment),
         redirect_stdout(out),
         redirect_stderr(err),

@@ -206,7 +206,12 @@ def test_what_has_parts_is_loaded_and_gone_with_them(
 
 
 def test_of_a_closed_registrar_nothing_is_written_and_nobody_answered(
-    app: rr.Registrar, provider: rr.Registrar, gate: Gate, told: Calls, monkeypatch: pytest.MonkeyPatch
+    system: rr.System,
+    app: rr.Registrar,
+    provider: rr.Registrar,
+    gate: Gate,
+    told: Calls,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     serve(provider, "thing", load=behind(gate))
     app.load("provider/thing", "before")
@@ -223,6 +228,7 @@ def test_of_a_closed_registrar_nothing_is_written_and_nobody_answered(
     thread.join()
     assert len(writes) == writes_before
     assert isinstance(outcome.items[0], rr.RrError)
+    system.stop(timeout_s=0)  # nobody answers the release of what it served
 
 
 # -- a write that fails ----------------------------------------------------------------------------------------------

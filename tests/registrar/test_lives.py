@@ -6,6 +6,7 @@ Real processes. At the end of each test `rr-actors check` finds nothing in the s
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -67,6 +68,23 @@ def test_what_a_killed_application_had_loaded_is_released_if_its_next_run_ends_w
     system.stop()
     assert served(state_dir) == []
     assert start().dormant() == []
+
+
+def test_a_stop_does_not_wait_for_a_manager_that_was_stopped_and_what_it_is_owed_follows(
+    start: Start, workshop: Workshop, caplog: pytest.LogCaptureFixture
+) -> None:
+    system = start(shop(workshop), config=rr.SystemConfig(stop_timeout_s=50.0))
+    system.open_registrar("app").load("shop/thing", Order("wheel"))
+    system.supervisor().terminate_child("shop")
+    began = time.monotonic()
+    system.stop()
+    assert time.monotonic() - began < 25, "half of the limit"
+    assert "app: 1 releases are owed to shop, and follow when that is opened again: it is stopped" in caplog.messages
+
+    system = start(shop(workshop))
+    assert list(system.open_registrar("app").queries()) == []
+    workshop.wait("unload wheel")
+    eventually(lambda: not system.registrar("shop").resources())
 
 
 def test_what_was_loaded_just_before_a_kill_and_released_while_its_provider_was_down_is_not_held_again(

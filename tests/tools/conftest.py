@@ -1,4 +1,4 @@
-"""Fixtures for tests of web pages: a browser for each module, a tab for each test."""
+"""Fixtures for tests of web pages: a browser for each process of tests, a tab for each test."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from support_browser import Chromium, Tab
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def chromium() -> Iterator[Chromium]:
     """A browser."""
     browser = Chromium()

@@ -169,6 +169,23 @@ def faults(tab: Tab, width: int) -> list[str]:
     return list(found)
 
 
+CUT_NODES = """(() => {
+    const cut = (element) => {
+        const mine = element.getBoundingClientRect(), panel = element.closest('.rr-panel').getBoundingClientRect();
+        return mine.left < panel.left || mine.right > panel.right || element.scrollWidth > element.clientWidth;
+    };
+    return [...document.querySelectorAll('.rr-node')].filter(cut).map(element => element.innerText);
+})()"""
+WIDER = "width => document.documentElement.scrollWidth > width"
+
+
+def fits(tab: Tab, width: int) -> None:
+    """Give the page this width, and see that it takes no more of it, and that no child is cut off."""
+    tab.do(tab.page.set_viewport_size({"width": width, "height": 900}))
+    tab.waits(lambda: not tab.do(tab.page.evaluate(WIDER, width)), f"a page as wide as {width}")
+    tab.waits(lambda: tab.do(tab.page.evaluate(CUT_NODES)) == [], f"whole children at {width}")
+
+
 @pytest.mark.parametrize("width", WIDTHS)
 def test_nothing_is_cut_off_or_covered_or_empty(system: rr.System, chromium: Chromium, width: int) -> None:
     with system.serve_web() as page, chromium.tab(width, 900) as tab:
@@ -185,7 +202,11 @@ def test_nothing_is_cut_off_or_covered_or_empty(system: rr.System, chromium: Chr
                     camera.id, rr.Status("WARNING", "dirty, and rather blurred too")
                 )
                 tab.sees(".rr-rows", "provider/camera")
+            if path == "tree":
+                tab.sees('[data-path="root/inner/somewhat-long-name"]', "running")
             found += [f"{path}: {fault}" for fault in faults(tab, width)]
+            for each in (1400, 2560, width):
+                fits(tab, each)
         assert found == []
 
 

@@ -1055,28 +1055,6 @@ def test_where_a_page_cannot_be_served_is_refused_before_anything_starts(
 
 # -- how it looks ----------------------------------------------------------------------------------------------------
 
-CUT = """(() => {
-    const cut = (element) => {
-        const mine = element.getBoundingClientRect(), panel = element.closest('.rr-panel').getBoundingClientRect();
-        return mine.left < panel.left || mine.right > panel.right || element.scrollWidth > element.clientWidth;
-    };
-    return [...document.querySelectorAll('.rr-node')].filter(cut).map(element => element.innerText);
-})()"""
-
-
-@pytest.mark.parametrize("width", [420, 1400, 2560])
-def test_no_page_is_wider_than_the_screen_and_no_child_is_cut_off(start: Start, chromium: Chromium, width: int) -> None:
-    inner = rr.Supervisor([rr.ChildSpec(rr.Actor, id="somewhat-long-name")], id="inner")
-    with start(rr.ChildSpec(rr.Actor, id="a"), inner).serve_web() as page, chromium.tab(width, 900) as tab:
-        tab.goes_to(page.url, "tree")
-        for path in ("", "tree", "timeline", "resources", "loads", "figures", "sequence"):
-            tab.do(tab.page.goto(page.url.partition("?")[0] + path))
-            tab.sees(".rr-main", "started")
-            assert tab.do(tab.page.evaluate("document.documentElement.scrollWidth")) <= width, path
-            if path == "tree":
-                tab.sees(node("root/inner/somewhat-long-name"), "running")
-                assert tab.do(tab.page.evaluate(CUT)) == []
-
 
 def test_the_figures_of_each_child_are_drawn_as_curves(shop: rr.System, tab: Tab) -> None:
     app = shop.open_registrar("app")

@@ -310,7 +310,7 @@ class Node(ProcessNode):
                 if releases is not None and not queries:
                     break
                 tried.update(queries)
-                owed = self._owed_to_dormant(registrar, queries)
+                owed = self._owed_to_absent(registrar, queries)
                 released = _AllDone(self.dispatcher.loop, len(queries) - len(owed), registrar.name)
                 releases = Releases(registrar, queries, functools.partial(_unless_owed, released, owed))
                 await released.future
@@ -341,19 +341,31 @@ class Node(ProcessNode):
                 return
             await registrar.next_change(_LOOK_AGAIN_S)
 
-    def _owed_to_dormant(self, registrar: RegistrarActor, queries: Sequence[str]) -> set[str]:
-        """Return the queries at dormant providers, and log them: their release does not end before these are opened."""
+    def _owed_to_absent(self, registrar: RegistrarActor, queries: Sequence[str]) -> set[str]:
+        """Return the queries whose release does not end now, and log them: nobody opens their providers meanwhile.
+
+        A dormant provider waits for a person. While the process stops, so does one that was stopped by itself: one
+        that stopped with its supervisor comes back with it.
+        """
         if not queries:
             return set()
         with registrar.lock:
             held = registrar.whole().held
             where = {id: held[id].registrar for id in queries if id in held}
-        dormant = {name for name in set(where.values()) if self.status_of(name) is Presence.DORMANT}
-        owed = {id for id, name in where.items() if name in dormant}
+        absent = {name: status for name in set(where.values()) if (status := self._absent(name)) is not None}
+        owed = {id for id, name in where.items() if name in absent}
         for name, count in Counter(where[id] for id in owed).items():
-            text = "%s: %d releases are owed to %s, and follow when that is opened again: it is dormant"
-            logger.warning(text, registrar.name, count, name)
+            text = "%s: %d releases are owed to %s, and follow when that is opened again: it is %s"
+            logger.warning(text, registrar.name, count, name, absent[name])
         return owed
+
+    def _absent(self, name: str) -> Presence | None:
+        """Return a registrar's status if nobody opens it again while this process closes its own."""
+        entry = self.find(name)
+        if entry is None or entry.turn is not None:
+            return None
+        absent = entry.status is Presence.DORMANT or (entry.status is Presence.STOPPED and bool(self.stopping))
+        return entry.status if absent else None
 
     def _why_closing(self, registrar: RegistrarActor) -> str:
         return self.stopping or f"registrar {registrar.name!r} is being closed"
