@@ -70,7 +70,7 @@ test-slow: $(STAMP)
 test-all: test-slow test
 
 test-ros: .venv-ros/.installed
-	.venv-ros/bin/python -m pytest -m ros tests/managers/test_ros2_peers.py $(ARGS)
+	.venv-ros/bin/python -m pytest -n 2 $(SECOND_RUN) -m ros tests/managers/test_ros2_*.py $(ARGS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

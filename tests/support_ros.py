@@ -7,10 +7,13 @@ import queue
 import threading
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future
 from typing import Any
 
 from rr_actors.managers.ros.ros_bridge import RosBridge
-from rr_actors.managers.ros.ros_graph import Answered, RosGraph
+from rr_actors.managers.ros.ros_graph import Answered, NodeGraph, RosGraph
+from rr_actors.managers.ros.ros_lifecycle import Transition
+from rr_actors.managers.ros.ros_nodes import RosNodes
 from support import eventually
 
 
@@ -24,7 +27,9 @@ class World:
         self.hearers = defaultdict[str, list[tuple[str, Callable[[Any], object]]]](list)
         self.latched = dict[str, Any]()
         self.services = dict[str, Callable[[bool, Answered], object]]()
-        self.joined = threading.Event()
+        self.joined = list[str]()  # the nodes that have joined, also again
+        self.processes = defaultdict[str, set[str]](set)  # by the name of their node; one that was killed is left here
+        self.lifecycles = dict[str, FakeLifecycle]()
 
     def publish(self, topic: str, value: Any) -> None:
         with self.lock:
@@ -55,6 +60,7 @@ class FakeGraph:
     def __init__(self, world: World, node: str) -> None:
         self._world, self._node = world, f"/{node.lstrip('/')}"
         world.present[self._node] = 1
+        world.joined.append(self._node)
 
     @property
     def node(self) -> str:
@@ -93,8 +99,58 @@ class FakeGraph:
             self._world.offered[service].add(self._node)
             self._world.services[service] = call
 
+    @property
+    def domain(self) -> int:
+        return DOMAIN
+
+    def instances(self, node: str) -> frozenset[str]:
+        return frozenset(self._world.processes[node])
+
+    def lifecycle(self, node: str) -> FakeLifecycle:
+        return self._world.lifecycles[node]
+
     def close(self) -> None:
         self._world.leave(self._node)
+
+
+DOMAIN = 7
+_TRANSITIONS = {
+    ("unconfigured", "configure"): "inactive",
+    ("inactive", "activate"): "active",
+    ("active", "deactivate"): "inactive",
+    ("inactive", "cleanup"): "unconfigured",
+}
+
+
+class FakeLifecycle:
+    """A lifecycle node: its state, the transitions that it was asked for, and how it behaves."""
+
+    def __init__(self) -> None:
+        self.state, self.asked = "unconfigured", list[str]()
+        self.refuses = dict[str, str]()  # a transition, and the state in which the node is then
+        self.loses = list[str]()  # transitions of which the next request does not arrive
+        self.is_silent = self.is_closed = False
+
+    def ask_state(self) -> Future[str]:
+        asked: Future[str] = Future()
+        if not self.is_silent:
+            asked.set_result(self.state)
+        return asked
+
+    def ask_transition(self, transition: Transition) -> Future[bool]:
+        asked: Future[bool] = Future()
+        if transition in self.loses:
+            self.loses.remove(transition)
+        elif not self.is_silent:
+            self.asked.append(transition)
+            refused = transition in self.refuses
+            now = self.refuses[transition] if refused else _TRANSITIONS.get((self.state, transition))
+            self.state = now or self.state
+            asked.set_result(now is not None and not refused)
+        return asked
+
+    def close(self) -> None:
+        self.is_closed = True
 
 
 WORLDS = dict[str, World]()
@@ -111,6 +167,22 @@ class FakeBridge(RosBridge):
         self.world = world
 
     def _join(self, node: str) -> RosGraph:
+        return FakeGraph(WORLDS[self.world], node)
+
+    def on_receive(self, message: Any) -> None:
+        raise RuntimeError(message)  # so its supervisor starts it again
+
+
+class FakeNodes(RosNodes):
+    """A manager of nodes of a World of this process."""
+
+    _discovery_s = 0.0
+
+    def __init__(self, world: str, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.world = world
+
+    def _join(self, node: str) -> NodeGraph:
         return FakeGraph(WORLDS[self.world], node)
 
     def on_receive(self, message: Any) -> None:

@@ -30,13 +30,27 @@ class Peer:
         self.executor.add_node(self.node)
         self.commands = queue.SimpleQueue()
         self.held, self.services, self.topics = {}, {}, {}
-        self.node.create_subscription(String, "/rr/answers", lambda got: say(answer=json.loads(got.data)), 100)
+        self.unanswered = {}  # sent again until it is answered: when it was sent last, and how it is sent
+        self.node.create_subscription(String, "/rr/answers", self.hear_answer, 100)
         self.node.create_timer(0.02, self.obey)
 
     def obey(self):
         while not self.commands.empty():
             command = self.commands.get()
             getattr(self, command.pop("do"))(**command)
+        for key, (sent_at, send) in list(self.unanswered.items()):
+            if time.monotonic() - sent_at >= 1.0:
+                self.send(key, send)
+
+    def send(self, key, send):
+        """Send it, and again until `unanswered` has the key no more: the other side may not be known yet, or be new."""
+        self.unanswered[key] = time.monotonic(), send
+        send()
+
+    def hear_answer(self, got):
+        answer = json.loads(got.data)
+        self.unanswered.pop((answer["for"], answer["id"]), None)
+        say(answer=answer)
 
     def load(self, key, server, request):
         def heard(status):
@@ -70,18 +84,22 @@ class Peer:
     def write(self, topic, text):
         if topic not in self.topics:
             self.topics[topic] = self.node.create_publisher(String, topic, 100)
-        self.topics[topic].publish(String(data=text))
+        key = topic.rpartition("/")[2], json.loads(text)["id"]
+        self.send(key, lambda: self.topics[topic].publish(String(data=text)))
 
     def call(self, service, data):
         if service not in self.services:
             self.services[service] = self.node.create_client(SetBool, service)
-        self.services[service].wait_for_service(30.0)
-        future = self.services[service].call_async(SetBool.Request(data=data))
+        key = service, time.monotonic()
 
         def ended(done):
-            say(service=service, ok=done.result().success, answer=json.loads(done.result().message))
+            if self.unanswered.pop(key, None) is not None:  # else it was sent twice, and answered twice
+                say(service=service, ok=done.result().success, answer=json.loads(done.result().message))
 
-        future.add_done_callback(ended)
+        def send():
+            self.services[service].call_async(SetBool.Request(data=data)).add_done_callback(ended)
+
+        self.send(key, send)
 
     def hear(self, topic, flag):
         qos = rclpy.qos.QoSProfile(depth=1, durability=rclpy.qos.DurabilityPolicy.TRANSIENT_LOCAL)

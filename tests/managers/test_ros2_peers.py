@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import os
 import queue
@@ -22,6 +21,7 @@ import pytest
 import rr_actors as rr
 from rr_actors import ros2
 from support import REPOSITORY, eventually, kill, wait_respawned
+from support_ros2 import domain_of_its_own
 
 pytest.importorskip("rclpy")
 
@@ -32,7 +32,6 @@ DEVICE = {"device": "/dev/video0"}
 CLIENT = REPOSITORY / "rr_actors" / "managers" / "ros" / "ros2_client.py"
 PEER = REPOSITORY / "tests" / "support_ros2_peer.py"
 LIMIT_S = 60.0
-_domains = itertools.count(os.getpid() * 7)
 
 
 class Peer:
@@ -148,20 +147,13 @@ class Place:
 
 @pytest.fixture
 def place(rr_system: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
-    """Each test has a domain of its own, on the loopback alone, without files in shared memory."""
-    for name, value in (
-        ("ROS_DOMAIN_ID", str(next(_domains) % 100 + 1)),
-        ("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
-        ("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4"),
-        ("ROS_LOG_DIR", str(tmp_path / "log")),
-    ):
-        monkeypatch.setenv(name, value)
-    place = Place(rr_system, tmp_path)
-    yield place
-    place.goes_on.set()
-    for peer in place.peers:
-        if peer.process.returncode is None:
-            peer.end()
+    with domain_of_its_own(monkeypatch, tmp_path):
+        place = Place(rr_system, tmp_path)
+        yield place
+        place.goes_on.set()
+        for peer in place.peers:
+            if peer.process.returncode is None:
+                peer.end()
 
 
 def test_two_nodes_load_the_same_camera_and_one_that_is_killed_is_released_by_its_lease(place: Place) -> None:

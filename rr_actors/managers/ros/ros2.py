@@ -1,4 +1,4 @@
-"""rr_actors.ros2: a bridge to ROS 2, and the client of it for nodes in Python."""
+"""rr_actors.ros2: a bridge to ROS 2, the client of it for nodes in Python, and nodes as resources."""
 
 from __future__ import annotations
 
@@ -8,18 +8,26 @@ from rr_actors.managers.ros.ros2_client import Ros2Query, Ros2Status, RosLoadFai
 from rr_actors.managers.ros.ros2_graph import Ros2Graph
 from rr_actors.managers.ros.ros_bridge import RosBridge
 from rr_actors.managers.ros.ros_config import Json, Switch
-from rr_actors.managers.ros.ros_graph import RosGraph
+from rr_actors.managers.ros.ros_errors import RosTimeout, TransitionFailed
+from rr_actors.managers.ros.ros_graph import NodeGraph, RosGraph
+from rr_actors.managers.ros.ros_nodes import RosNode, RosNodes
+from rr_actors.managers.ros.ros_programs import RunNode
 
 __all__ = [
     "Bridge",
     "Client",
     "Json",
     "MissingDependency",
+    "Nodes",
     "NotAllowed",
     "Ros2Query",
     "Ros2Status",
     "RosLoadFailed",
+    "RosNode",
+    "RosTimeout",
+    "RunNode",
     "Switch",
+    "TransitionFailed",
 ]
 
 
@@ -35,4 +43,19 @@ class Bridge(RosBridge):
     """
 
     def _join(self, node: str) -> RosGraph:
+        return Ros2Graph(node)
+
+
+class Nodes(RosNodes):
+    """Serves `node`: starts, configures, activates, pauses and ends nodes of ROS 2, as resources.
+
+    A node is loaded when it is in the graph, and a lifecycle node when it is active. A paused lifecycle node is
+    inactive. One that nobody needs is deactivated, cleaned up, and ended. A node that dies concerns its holders alone:
+    they hear FATAL at once, with the last lines of its output. Its program is a resource of a manager Programs of the
+    system.
+
+    rclpy has to be importable, as for Bridge. The domain is that of the environment, `ROS_DOMAIN_ID`.
+    """
+
+    def _join(self, node: str) -> NodeGraph:
         return Ros2Graph(node)

@@ -6,16 +6,22 @@ imported when a bridge starts. The protocols below are what is used of it.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import os
 import threading
 from collections import defaultdict
 from collections.abc import Awaitable, Callable, Mapping, Sequence
+from concurrent.futures import Future
 from types import ModuleType
 from typing import Protocol, TypeVar, cast
 
 from rr_actors.base.errors import MissingDependency, text_of
 from rr_actors.base.reporting.log import Log
+from rr_actors.base.toml import wrong
 from rr_actors.managers.ros.ros_graph import Answered
+from rr_actors.managers.ros.ros_lifecycle import Lifecycle, Transition
+from rr_actors.managers.ros.ros_programs import DOMAIN
 
 logger = Log("rr_actors.managers.ros")
 
@@ -24,8 +30,10 @@ INSTALL = (
     "Python of that distribution; or `pip install 'ros-jazzy-rclpy[fastrtps]' ros-jazzy-std-msgs ros-jazzy-std-srvs`"
 )
 _DEPTH = 1000  # of messages that wait for a slow reader
+_LAST_DOMAIN = 232  # the ports of the next one are above 65535: Fast DDS ends the process for that
+_OF_ALL_NODES = ("/parameter_events", "/rosout")  # each node publishes one of them, if not both
 
-T = TypeVar("T", covariant=True)
+T = TypeVar("T")
 
 
 class _Message(Protocol):
@@ -53,7 +61,61 @@ class _Guard(Protocol):
     def trigger(self) -> None: ...
 
 
-class _Context(Protocol): ...
+class _Context(Protocol):
+    def get_domain_id(self) -> int: ...
+
+
+class _Reply(Protocol):
+    def add_done_callback(self, call: Callable[[_Reply], object], /) -> None: ...
+    def cancelled(self) -> bool: ...
+    def exception(self) -> BaseException | None: ...
+    def result(self) -> object: ...
+
+
+class _Client(Protocol):
+    def call_async(self, request: object, /) -> _Reply: ...
+    def remove_pending_request(self, reply: _Reply, /) -> None: ...
+
+
+class _EndpointInfo(Protocol):
+    node_name: str
+    node_namespace: str
+    endpoint_gid: Sequence[int]
+
+
+class _State(Protocol):
+    label: str
+
+
+class _StateAnswer(Protocol):
+    current_state: _State
+
+
+class _TransitionRequest(Protocol):
+    @property
+    def transition(self) -> _Transition: ...
+
+
+class _Transition(Protocol):
+    id: int
+    label: str
+
+
+class _TransitionAnswer(Protocol):
+    success: bool
+
+
+class _GetState(Protocol):
+    def Request(self) -> object: ...  # noqa: N802
+
+
+class _ChangeState(Protocol):
+    def Request(self) -> _TransitionRequest: ...  # noqa: N802
+
+
+class _LifecycleSrvs(Protocol):
+    GetState: _GetState
+    ChangeState: _ChangeState
 
 
 class _Future(Awaitable[tuple[bool, str]], Protocol):
@@ -80,6 +142,9 @@ class _Node(Protocol):
         *,
         callback_group: object,
     ) -> object: ...
+    def create_client(self, kind: object, name: str, *, callback_group: object) -> _Client: ...
+    def destroy_client(self, client: _Client, /) -> object: ...
+    def get_publishers_info_by_topic(self, topic: str, /) -> Sequence[_EndpointInfo]: ...
     def create_guard_condition(self, call: Callable[[], None], /) -> _Guard: ...
     def destroy_node(self) -> None: ...
 
@@ -169,7 +234,9 @@ class Ros2Graph:
 
         Raises:
             MissingDependency: rclpy, std_msgs or std_srvs cannot be imported.
+            ConfigError: ROS_DOMAIN_ID is no domain. `.key`, `.expected`, `.got`
         """
+        check_domain(os.environ.get(DOMAIN, ""))
         ros = self._ros = Libraries()
         self._context = ros.contexts.Context()
         ros.rclpy.init(context=self._context)  # in a context of its own: it handles no signal
@@ -197,6 +264,11 @@ class Ros2Graph:
         """The full name of the node."""
         return self._name
 
+    @property
+    def domain(self) -> int:
+        """The domain: nodes of another one are not in the graph."""
+        return self._context.get_domain_id()
+
     def nodes(self) -> frozenset[str]:
         """Return the full names of all nodes that are in the graph now."""
         return frozenset(_full(name, namespace) for name, namespace in self._node.get_node_names_and_namespaces())
@@ -216,6 +288,33 @@ class Ros2Graph:
                 for offered, _types in listed:
                     found[offered].add(_full(name, namespace))
         return {name: frozenset(nodes) for name, nodes in found.items()}
+
+    def instances(self, node: str) -> frozenset[str]:
+        """Return a text for each process that has a node of this full name now: of what a node publishes, its number.
+
+        DDS numbers what a process publishes, and the first 12 bytes are of that process.
+        """
+        found = {
+            bytes(info.endpoint_gid[:12]).hex()
+            for topic in _OF_ALL_NODES
+            for info in self._node.get_publishers_info_by_topic(topic)
+            if _full(info.node_name, info.node_namespace) == node
+        }
+        return frozenset(found or ({"unnumbered"} if node in self.nodes() else ()))
+
+    def lifecycle(self, node: str) -> Lifecycle:
+        """Return the services of a lifecycle node.
+
+        Raises:
+            MissingDependency: lifecycle_msgs cannot be imported.
+        """
+        return _LifecycleServices(
+            cast("_LifecycleSrvs", _imported("lifecycle_msgs.srv")),
+            self._node,
+            node,
+            self._ros.groups.ReentrantCallbackGroup(),
+            self._unless_closed,
+        )
 
     def hear(self, topic: str, call: Callable[[str], object]) -> None:
         """Call `call(text)` for each String of a topic."""
@@ -288,6 +387,76 @@ class Ros2Graph:
         if latched:
             return self._ros.qos.QoSProfile(depth=1, durability=durability.TRANSIENT_LOCAL)
         return self._ros.qos.QoSProfile(depth=_DEPTH, durability=durability.VOLATILE)
+
+
+class _LifecycleServices:
+    """The services of one lifecycle node, by clients of ours."""
+
+    def __init__(
+        self,
+        srvs: _LifecycleSrvs,
+        own: _Node,
+        node: str,
+        group: object,
+        unless_closed: Callable[[Callable[[], object]], None],
+    ) -> None:
+        self._srvs, self._own, self._unless_closed = srvs, own, unless_closed
+        self._get = own.create_client(srvs.GetState, f"{node}/get_state", callback_group=group)
+        self._change = own.create_client(srvs.ChangeState, f"{node}/change_state", callback_group=group)
+
+    def ask_state(self) -> Future[str]:
+        """Ask for its state."""
+        return self._ask(
+            self._get, self._srvs.GetState.Request(), lambda got: cast("_StateAnswer", got).current_state.label
+        )
+
+    def ask_transition(self, transition: Transition) -> Future[bool]:
+        """Ask for a transition by its name: to one that it cannot make now, a node says no; by number, it fails."""
+        request = self._srvs.ChangeState.Request()
+        request.transition.label = transition
+        return self._ask(self._change, request, lambda got: cast("_TransitionAnswer", got).success)
+
+    def close(self) -> None:
+        """End the clients."""
+        self._unless_closed(lambda: self._own.destroy_client(self._get))
+        self._unless_closed(lambda: self._own.destroy_client(self._change))
+
+    def _ask(self, client: _Client, request: object, read: Callable[[object], T]) -> Future[T]:
+        asked: Future[T] = Future()
+
+        def ended(reply: _Reply) -> None:
+            if reply.cancelled() or not asked.set_running_or_notify_cancel():
+                return
+            error = reply.exception()
+            if error is not None:
+                asked.set_exception(error)
+            else:
+                asked.set_result(read(reply.result()))
+
+        def ask() -> None:
+            reply = client.call_async(request)
+            reply.add_done_callback(ended)
+
+            def forget(asked: Future[T]) -> None:
+                if asked.cancelled():
+                    with contextlib.suppress(Exception):  # it has just been answered
+                        client.remove_pending_request(reply)
+
+            asked.add_done_callback(forget)
+
+        self._unless_closed(ask)
+        return asked
+
+
+def check_domain(given: str) -> None:
+    """Check what the environment says of the domain; "" is domain 0.
+
+    Raises:
+        ConfigError: it is no number from 0 to 232. `.key`, `.expected`, `.got`
+    """
+    number = given.strip()
+    if number and not (number.isdecimal() and int(number) <= _LAST_DOMAIN):
+        raise wrong(None, DOMAIN, f"a whole number from 0 to {_LAST_DOMAIN}", given, where="environment")
 
 
 def _full(name: str, namespace: str) -> str:

@@ -11,10 +11,8 @@ from __future__ import annotations
 import abc
 import contextlib
 import functools
-import hashlib
 import os
 import queue
-import re
 import threading
 import time
 from collections import defaultdict
@@ -42,7 +40,7 @@ from rr_actors.managers.ros.ros_config import (
     parse_exposed,
     status_topic,
 )
-from rr_actors.managers.ros.ros_graph import Answered, RosGraph, check_free
+from rr_actors.managers.ros.ros_graph import DISCOVERY_S, Answered, RosGraph, check_free, own_name
 from rr_actors.managers.ros.ros_messages import Key, Load, Renew, Unload, Verb, answer_text, error_table, key_in, parsed
 from rr_actors.registrar.declarations import server
 from rr_actors.registrar.manager import Manager
@@ -52,7 +50,6 @@ from rr_actors.registrar.servers.callback_context import current
 
 logger = Log("rr_actors.managers.ros")
 
-_DISCOVERY_S = 2.0  # until a new node has seen the others: 0.3 s, or longer on a busy machine
 _LOOK_S = 0.5
 _SOON_S = 0.1  # while a load waits for its owner to be in the graph
 _CLASHES_S = 10.0  # between two looks for another node that offers the same names
@@ -64,7 +61,7 @@ class RosBridge(Manager):
     """What both versions' bridges do. A version's class joins its graph."""
 
     _side_by_side = True
-    _discovery_s = _DISCOVERY_S
+    _discovery_s = DISCOVERY_S
 
     def __init__(
         self, file: str | os.PathLike[str] | None = None, *, switches: Sequence[Switch] = (), json: Json | None = None
@@ -107,9 +104,9 @@ class RosBridge(Manager):
             MissingDependency: the libraries of ROS cannot be imported.
             NameTaken: another node offers one of the names.
         """
-        graph = self._graph = self._join(_node_name(self.registrar.name, self.registrar.directory))
+        graph = self._graph = self._join(own_name(self.registrar.name, self.registrar.directory))
         try:
-            time.sleep(self._discovery_s)  # nobody else says when a node has seen the others
+            time.sleep(self._discovery_s)
             check_free(graph, offered_by(self._exposed))
             json = self._exposed.json
             self._book = HoldBook(json, f"{json.namespace}/load" if json is not None else "load")
@@ -386,9 +383,3 @@ def _plain_response(query: Query) -> Any:
 
 def _nowhere(_text: str) -> None:
     """Publish nothing: there is no such topic."""
-
-
-def _node_name(registrar: str, directory: Path) -> str:
-    """Return a name that the same bridge has after a restart, and no other on this machine."""
-    place = hashlib.sha256(str(directory).encode()).hexdigest()[:8]
-    return f"rr_{re.sub('[^A-Za-z0-9_]', '_', registrar)}_{place}"

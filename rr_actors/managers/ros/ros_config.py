@@ -27,7 +27,7 @@ from rr_actors.base.toml import parse_typed, raise_faults, wrong
 
 _RELATIVE = re.compile(r"(?!.*__)[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*\Z")
 _PATTERN = re.compile(r"[A-Za-z0-9_\-.*?]+/[A-Za-z0-9_\-.*?]+\Z")
-_RULE = "ASCII letters, digits and '_' between '/', without '__', no part of it beginning with a digit"
+NAME_RULE = "ASCII letters, digits and '_' between '/', without '__', no part of it beginning with a digit"
 
 Priority = Annotated[int, msgspec.Meta(ge=-1000, le=1000)]
 
@@ -67,6 +67,11 @@ class Exposed(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     switch: tuple[Switch, ...] = ()
     json: Json | None = None
+
+
+def is_ros_name(text: str) -> bool:
+    """Return whether a text is a name of ROS without a "/" in front."""
+    return _RELATIVE.match(text) is not None
 
 
 def hold_service(switch: str) -> str:
@@ -120,8 +125,8 @@ def _faults(exposed: Exposed, file: str | None) -> Iterator[ConfigError]:
         yield fault("", "a [[switch]] or [json]", None, "neither")
     known = set[str]()
     if exposed.json is not None:
-        if not exposed.json.namespace.startswith("/") or not _RELATIVE.match(exposed.json.namespace[1:]):
-            yield fault("json.namespace", f"'/' and {_RULE}", exposed.json.namespace)
+        if not exposed.json.namespace.startswith("/") or not is_ros_name(exposed.json.namespace[1:]):
+            yield fault("json.namespace", f"'/' and {NAME_RULE}", exposed.json.namespace)
         if not exposed.json.allow:
             yield fault("json.allow", "at least one server, such as 'cameras/*'", exposed.json.allow, "none")
         for i, pattern in enumerate(exposed.json.allow):
@@ -130,8 +135,8 @@ def _faults(exposed: Exposed, file: str | None) -> Iterator[ConfigError]:
         known = set(offered_by(Exposed(json=exposed.json)))
     for i, switch in enumerate(exposed.switch):
         key, names = f"switch[{i}]", set(offered_by(Exposed((switch,))))
-        if not _RELATIVE.match(switch.name):
-            yield fault(f"{key}.name", _RULE, switch.name)
+        if not is_ros_name(switch.name):
+            yield fault(f"{key}.name", NAME_RULE, switch.name)
         elif known & names:
             yield fault(f"{key}.name", "a name whose topics no other part of the bridge has", switch.name)
         known |= names
