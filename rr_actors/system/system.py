@@ -946,11 +946,7 @@ class System:
         raise UsageError(f"system {self.name!r}: it was stopped while its web page started")
 
     def record(
-        self,
-        file: str | os.PathLike[str] | None = None,
-        *,
-        limit: int = RECORDING_LIMIT,
-        decisions: bool = False,
+        self, file: str | os.PathLike[str] | None = None, *, limit: int = RECORDING_LIMIT, decisions: bool = False
     ) -> Recording:
         """Begin to record what happens: events, exits, callbacks, and the messages between registrars.
 
@@ -961,8 +957,8 @@ class System:
             file: a new file to write it to, without a bound; None: it is in memory. A thread writes the file, and
                 misses entries if the disk is too slow.
             limit: how many entries are kept in memory; the oldest are dropped first.
-            decisions: have the registrars record all that they decide, too, for rr.replay(). Requests and responses are
-                in such a recording as a whole, and loads take longer (docs/replay.md).
+            decisions: have the registrars record all that they decide, for `rr-actors replay`. Such a recording has
+                whole requests and responses, and loads take longer meanwhile (docs/replay.md).
 
         Raises:
             UsageError: the system does not run, limit is no whole number above 0, or decisions is no bool.

@@ -1,8 +1,8 @@
 """Decisions that were noted, decided again by today's code, and what is different. No I/O, clock, thread or randomness.
 
-    registrar = DecidedAgain()
-    registrar.begin(began)
-    result = registrar.decide(decided)
+registrar = DecidedAgain()
+registrar.begin(began)
+result = registrar.decide(decided)
 """
 
 from __future__ import annotations
@@ -14,14 +14,7 @@ import msgspec
 
 from rr_actors.base.errors import text_of
 from rr_actors.registrar.core.decide import decide, refuse_uncommitted
-from rr_actors.registrar.decisions.decided import (
-    OUTSIDE,
-    Began,
-    Decided,
-    all_of,
-    apply_outside,
-    catalog_of,
-)
+from rr_actors.registrar.decisions.decided import OUTSIDE, Began, Decided, all_of, apply_outside, catalog_of
 from rr_actors.registrar.decisions.typed_values import plain
 from rr_actors.registrar.model.catalog import Catalog
 from rr_actors.registrar.model.rows import Change, Drop, Row, Table, key_of_row

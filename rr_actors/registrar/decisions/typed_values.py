@@ -55,6 +55,7 @@ CLASSES: dict[str, type[msgspec.Struct]] = {
 }
 """The classes that a text may have, by name."""
 _ENUMS: dict[str, type[Enum]] = {cls.__name__: cls for cls in (State, Phase, Hold)}
+_LONGEST = 2**30  # bytes of a value, against texts that are made to fill the memory
 _SCALARS = frozenset((type(None), bool, int, float, str, bytes))
 _LIST, _TUPLE, _DICT, _SET = "list", "tuple", "dict", "set"
 _MISSING = object()
@@ -149,6 +150,10 @@ def value_from(text: str) -> Any:
         UnknownValue: the text is damaged, or of a version with other values.
     """
     try:
-        return value_of(msgspec.msgpack.decode(zlib.decompress(base64.b64decode(text, validate=True))))
+        reader = zlib.decompressobj()
+        data = reader.decompress(base64.b64decode(text, validate=True), _LONGEST)
+        if not reader.eof:
+            raise UnknownValue("damaged: it is cut, or too long")
+        return value_of(msgspec.msgpack.decode(data))
     except (binascii.Error, zlib.error, msgspec.MsgspecError, RecursionError) as error:
         raise UnknownValue(f"damaged: {error}") from error

@@ -260,6 +260,7 @@ TABLES: dict[Table, type[Row]] = {
 }
 TABLE_OF: dict[type[Row], Table] = {cls: table for table, cls in TABLES.items()}
 
+
 def key_of_row(row: Row) -> tuple[Table, str]:
     """Return the table and the id of a row."""
     return TABLE_OF[type(row)], row.id

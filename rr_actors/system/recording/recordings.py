@@ -252,7 +252,7 @@ class Recording:
     def entries(self) -> list[Entry]:
         """Return the entries, oldest first. Those of the last tenth of a second may be missing.
 
-        Those of decisions are not among them: rr.replay() reads these.
+        Those of decisions are not among them: replay() reads these.
 
         Raises:
             ConfigError: the recording's file cannot be read.
@@ -260,7 +260,7 @@ class Recording:
         return [entry for entry in self._all() if entry.event != DECIDED]
 
     def decisions(self) -> list[Entry]:
-        """Return the entries of decisions, oldest first; rr.replay() makes something of them.
+        """Return the entries of decisions, oldest first; replay() decides them again.
 
         Raises:
             ConfigError: the recording's file cannot be read.
