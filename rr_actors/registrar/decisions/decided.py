@@ -87,26 +87,18 @@ def catalog_of(began: Began) -> Catalog:
     catalog = Catalog(began.name, content_of(began.rows), began.epoch)
     for name, value in began.memory.items():
         known: Any = getattr(catalog, name)
-        if isinstance(known, defaultdict):  # by_request: dicts in a dict
-            known.clear()
-            known.update(value)
-        else:
-            setattr(catalog, name, value)
+        is_made = isinstance(known, defaultdict)  # by_request: dicts in a dict
+        setattr(catalog, name, defaultdict(dict, value) if is_made else value)
     return catalog
 
 
 def apply_outside(catalog: Catalog, outside: Outside) -> None:
     """Make the changes of other code than decisions."""
     for name, (put, taken) in outside.items():
-        known: Any = getattr(catalog, name)
-        if isinstance(known, set):
-            found: set[Any] = known
-            found.update(put)
-            found.difference_update(taken)
-        else:
-            known.update(put)
-            for key in taken:
-                known.pop(key, None)
+        known: dict[Any, Any] | set[Any] = getattr(catalog, name)
+        known.update(put)
+        for key in taken:
+            known.discard(key) if isinstance(known, set) else known.pop(key, None)
 
 
 def outside_of(before: dict[Any, Any], now: dict[Any, Any]) -> tuple[dict[Any, Any], list[Any]]:

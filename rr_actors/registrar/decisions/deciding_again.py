@@ -7,6 +7,7 @@ result = registrar.decide(decided)
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Sequence
 from typing import Any, Literal
 
@@ -165,8 +166,8 @@ def _differing(of: _Of, recorded: Sequence[Any], today: Sequence[Any]) -> Iterab
         if text in left:
             left.remove(text)
             only_today.append(one)
-    for index in range(max(len(only_recorded), len(only_today))):
-        yield Difference(of, *(ones[index] if index < len(ones) else None for ones in (only_recorded, only_today)))
+    for one, other in itertools.zip_longest(only_recorded, only_today):
+        yield Difference(of, one, other)
     if not only_recorded and not only_today:  # the same ones in another order
         place = next(place for place, text in enumerate(texts) if text != texts_today[place])
         yield Difference(of, recorded[place], today[place], f"at place {place + 1}")

@@ -11,10 +11,11 @@ import binascii
 import zlib
 from enum import Enum
 from types import ModuleType
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 import msgspec
 
+from rr_actors.base.errors import shown
 from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.decisions.decided import Began, Decided
 from rr_actors.registrar.model import commands, effects
@@ -82,8 +83,7 @@ def plain(value: Any) -> Any:
 
     Fields that have their default are left out, so a later version that adds a field can read the text.
     """
-    kind: type[Any] = type(value)
-    if kind in _SCALARS:
+    if (kind := cast("type[Any]", type(value))) in _SCALARS:
         return value
     if (known := _FIELDS.get(kind)) is not None:
         name, fields = known
@@ -115,9 +115,9 @@ def value_of(found: Any) -> Any:
     """
     if type(found) is not list:
         return found
+    kind, *rest = cast("list[Any]", found) or [""]
+    parts = [value_of(part) for part in rest]
     try:
-        kind, *rest = found
-        parts = [value_of(part) for part in rest]
         if kind == _LIST:
             return parts
         if kind == _TUPLE:
@@ -130,12 +130,10 @@ def value_of(found: Any) -> Any:
             (text,) = parts
             return _ENUMS[kind](text)
         return CLASSES[kind](**dict(zip(parts[::2], parts[1::2], strict=True)))
-    except UnknownValue:
-        raise
     except KeyError:
-        raise UnknownValue(f"no class {found[0]!r} is known here") from None
+        raise UnknownValue(f"no class {shown(kind)} is known here") from None
     except (TypeError, ValueError) as error:
-        raise UnknownValue(f"{found[0] if found else 'a value'}: {error}") from error
+        raise UnknownValue(f"{shown(kind)}: {error}") from error
 
 
 def text_from(value: Any) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from enum import Enum
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 
@@ -16,7 +16,7 @@ from rr_actors.registrar.decisions.decided import Began
 from rr_actors.registrar.decisions.deciding_again import Difference, RowChange
 from rr_actors.registrar.decisions.typed_values import Opaque
 from rr_actors.registrar.model.effects import Receive, SendReply, SendRequest
-from rr_actors.registrar.model.rows import TABLES
+from rr_actors.registrar.model.rows import key_of_row
 from rr_actors.system.recording.event_texts import clock
 from rr_actors.system.rewound.replaying import ReplayStep
 
@@ -126,8 +126,7 @@ def _said(step: ReplayStep) -> str:
 
 
 def _rows(began: Began) -> list[RowChange]:
-    tables = {cls: table for table, cls in TABLES.items()}
-    return [RowChange(tables[type(row)], row.id, None, row) for row in began.rows]
+    return [RowChange(*key_of_row(row), None, row) for row in began.rows]
 
 
 def _item_text(item: Any, sender: str | None) -> str:
@@ -233,11 +232,11 @@ def _value_text(value: Any) -> str:
             said = ", ".join(f"{name}={_value_text(one)}" for name, one in _fields(value))
             return f"{type(value).__name__}({said})"
         case list() | tuple() | set():
-            several: Iterable[Any] = value
-            return f"[{', '.join(map(_value_text, several))}]"
+            several = ", ".join(map(_value_text, cast("Iterable[Any]", value)))
+            return f"[{several}]"
         case dict():
-            pairs: dict[Any, Any] = value
-            return "{" + ", ".join(f"{_value_text(key)}: {_value_text(one)}" for key, one in pairs.items()) + "}"
+            pairs = cast("dict[Any, Any]", value).items()
+            return "{" + ", ".join(f"{_value_text(key)}: {_value_text(one)}" for key, one in pairs) + "}"
         case _:
             return str(value)
 
@@ -251,11 +250,9 @@ def _plain(value: Any) -> Any:
         case msgspec.Struct():
             return {"is": type(value).__name__} | {one: _plain(getattr(value, one)) for one in value.__struct_fields__}
         case list() | tuple() | set():
-            several: Iterable[Any] = value
-            return [_plain(one) for one in several]
+            return [_plain(one) for one in cast("Iterable[Any]", value)]
         case dict():
-            pairs: dict[Any, Any] = value
-            return {_value_text(key): _plain(one) for key, one in pairs.items()}
+            return {_value_text(key): _plain(one) for key, one in cast("dict[Any, Any]", value).items()}
         case Enum():
             return str(value)
         case _:
