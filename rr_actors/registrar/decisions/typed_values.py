@@ -15,7 +15,7 @@ from typing import Any, cast, get_args
 
 import msgspec
 
-from rr_actors.base.errors import shown
+from rr_actors.base.errors import shortened, shown
 from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.decisions.decided import Began, Decided
 from rr_actors.registrar.model import commands, effects
@@ -133,7 +133,7 @@ def value_of(found: Any) -> Any:
     except KeyError:
         raise UnknownValue(f"no class {shown(kind)} is known here") from None
     except (TypeError, ValueError) as error:
-        raise UnknownValue(f"{shown(kind)}: {error}") from error
+        raise UnknownValue(f"{shortened(str(kind))}: {error}") from error
 
 
 def text_from(value: Any) -> str:

@@ -151,8 +151,9 @@ def _replayed(title: str, entries: Iterable[Entry]) -> Replay:
             raise TypeError(f"expected a decision, got {type(value).__name__}")
         if number != line.last + 1 and line.again.is_known:
             if number > line.last + 1:
-                missing = counted(number - line.last - 1, "decision")
-                notes.append(f"{entry.registrar}: {missing} are missing before its step {_next(steps, entry)}")
+                count = number - line.last - 1
+                missing = f"{counted(count, 'decision')} {'is' if count == 1 else 'are'} missing"
+                notes.append(f"{entry.registrar}: {missing} before its step {_next(steps, entry)}")
             line.again.lose()
         line.last = number
         steps.setdefault(entry.registrar, []).append(_step(entry, _next(steps, entry), value, line.again))
