@@ -53,6 +53,7 @@ class DecisionNotes:
         items = list(items)
         if self._begun is not None:  # an interrupt came before its end was noted
             self.doubt()
+        self._begun = items, {}
         if self._catalog is not catalog or self._recording != recording:
             known = self._catalog is catalog
             self._catalog, self._recording = catalog, recording
@@ -91,14 +92,14 @@ class DecisionNotes:
         self._note_end(decision, end="refused", why=failure.message, again=list(again), failure=failure)
 
     def _note_end(self, decision: Decision | None, **more: Any) -> None:
-        begun, self._begun = self._begun, None
-        if begun is None:
+        if (begun := self._begun) is None:
             return
         if decision is None:
             self._note(Decided(*begun, **more))
         else:
             changes, later = list(decision.changes), list(decision.later.values())
             self._note(Decided(*begun, changes, later, list(decision.effects), **more))
+        self._begun = None  # at last: after an interrupt before this, the next note has all
 
     def _note(self, what: Any) -> None:
         try:

@@ -28,7 +28,6 @@ from rr_actors.base.values.failure import failure_of
 from rr_actors.hosting.process_node import ProcessNode
 from rr_actors.hosting.run_files import DECISIONS
 from rr_actors.registrar.core.decide import Item, refuse_uncommitted
-from rr_actors.registrar.decisions.decision_notes import DecisionNotes
 from rr_actors.registrar.engine.progress import ProgressListeners, ProgressReports
 from rr_actors.registrar.engine.registrar_state import RegistrarState
 from rr_actors.registrar.engine.status import StatusMessage
@@ -152,9 +151,8 @@ class RegistrarBase(RegistrarState, abc.ABC):
     def __init__(self, opening: Opening) -> None:
         self.node, name, config, store, self.peers, self.recorder, self.path = opening
         self.workers = self.node.dispatcher.workers
-        self.watched = self.node.watched
-        self.notes = DecisionNotes(name, self.recorder.decision)
-        super().__init__(name, config, store, self.node.dispatcher.loop, self.workers)
+        loop, watched = self.node.dispatcher.loop, self.node.watched
+        super().__init__(name, config, store, loop, self.workers, watched, self.recorder.decision)
         self.commits.watched = self.node.watched
         self.gathers = not self.commits.row_by_row
         self.serving = False

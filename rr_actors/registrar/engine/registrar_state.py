@@ -29,7 +29,7 @@ from rr_actors.registrar.core.callback_runs import is_unwanted
 from rr_actors.registrar.core.decide import Item, decide
 from rr_actors.registrar.core.loads.loading import join
 from rr_actors.registrar.core.unloading import leave
-from rr_actors.registrar.decisions.decision_notes import DecisionNotes
+from rr_actors.registrar.decisions.decision_notes import DecisionNotes, Send
 from rr_actors.registrar.engine.commit_log import CommitLog
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import digests
@@ -93,12 +93,19 @@ class RegistrarState(TurnActor):
     """
 
     taken_by_senders = True
-    watched: Watched
-    notes: DecisionNotes
 
     def __init__(
-        self, name: str, config: RegistrarConfig, store: Store, loop: AbstractEventLoop, workers: Workers
+        self,
+        name: str,
+        config: RegistrarConfig,
+        store: Store,
+        loop: AbstractEventLoop,
+        workers: Workers,
+        watched: Watched,
+        send_note: Send,
     ) -> None:
+        self.watched = watched
+        self.notes = DecisionNotes(name, send_note)
         self.name = name
         self.config = config
         self.commits = CommitLog(name, config, store, loop, workers, self.lock)
@@ -138,8 +145,8 @@ class RegistrarState(TurnActor):
         catalog = self.catalog
         if catalog.unfinished is not None:
             self.commits.restore(catalog)
-            catalog.unfinished = None
             self.notes.doubt()
+            catalog.unfinished = None
         return catalog
 
     def commit(self, items: Iterable[Item]) -> Decision:
