@@ -20,6 +20,8 @@ from rr_actors.wire.unix_transport import UnixTransport
 _NAME = "watched"
 _EVENTS, _MESSAGES = 1, 3
 """Values of the byte: send events; send events and messages."""
+DECISIONS = 4
+"""From this value on, the decisions of registrars, too. A recording that wants them sets another of these values."""
 
 
 class Watched:
@@ -32,8 +34,9 @@ class Watched:
         run_dir: the system's StateDir.run_dir.
 
     Attributes:
-        level: the byte: 0 nobody watches, 1 events are wanted, above 1 the messages between registrars, too. Code
-            that runs in every load reads it here, in 20 ns; bool() takes five times as long.
+        level: the byte: 0 nobody watches, 1 events are wanted, above 1 the messages between registrars, too, and from
+            DECISIONS on their decisions. Code that runs in every load reads it here, in 20 ns; bool() takes five times
+            as long.
 
     Raises:
         ConfigError: the file cannot be made there.
@@ -77,9 +80,16 @@ class Watched:
     def __bool__(self) -> bool:
         return self.level[0] != 0
 
-    def set(self, watched: bool, recording: bool = False) -> None:
-        """Set the byte for all processes of the system; `recording` wants events and messages."""
-        self.level[0] = _MESSAGES if recording else _EVENTS if watched else 0
+    def set(self, watched: bool, recording: bool = False, decisions: int = 0) -> None:
+        """Set the byte for all processes of the system; `recording` wants events and messages.
+
+        Args:
+            decisions: the number of the newest recording that wants decisions, too; 0: there is none.
+        """
+        if decisions:
+            self.level[0] = DECISIONS + decisions % (256 - DECISIONS)
+        else:
+            self.level[0] = _MESSAGES if recording else _EVENTS if watched else 0
 
 
 LOOK_S = 5.0

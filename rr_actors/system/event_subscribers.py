@@ -175,6 +175,7 @@ class Subscribers:
         self._callbacks: dict[int, tuple[str, Callable[..., Any]]] = {}
         self._backlogs: dict[int, Backlog[Facts]] = {}  # filled on the loop; other threads only remove from it
         self._listeners: dict[int, tuple[Callable[[Facts], None], bool]] = {}  # and whether it records
+        self._of_decisions: dict[int, int] = {}  # the recordings that want decisions
         self._numbers = itertools.count(1)
         self.listened = False  # whether anybody listens
         self._node: Node | None = None
@@ -215,6 +216,10 @@ class Subscribers:
             records: have the processes send their entries, too, as "recorded" events.
         """
         return self._add(self._listeners, (listener, records))
+
+    def want_decisions(self) -> Callable[[], None]:
+        """Have the registrars note their decisions, for those who listen with `records`; return what ends that."""
+        return self._add(self._of_decisions, 0)
 
     def _add(self, those: dict[int, T], one: T) -> Callable[[], None]:
         number = next(self._numbers)
@@ -274,7 +279,7 @@ class Subscribers:
             self.listened = bool(self._callbacks or self._listeners)
             if (node := self._node) is not None:
                 records = any(records for _, records in list(self._listeners.values()))
-                node.watched.set(self.listened, records)
+                node.watched.set(self.listened, records, max(list(self._of_decisions), default=0))
 
 
 def _name_of(callback: Callable[..., Any]) -> str:

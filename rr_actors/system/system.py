@@ -212,7 +212,8 @@ class System:
         self._subscribers = Subscribers(self.name)
         self._logs: Backlog[Facts] | None = None  # of this run; used on the loop, except at the end of the run
         self._counters = Counters()
-        self._recordings = Recordings(functools.partial(self._subscribers.listen, records=True), self._counters)
+        listen = functools.partial(self._subscribers.listen, records=True)
+        self._recordings = Recordings(listen, self._subscribers.want_decisions, self._counters)
         self._dead_letters = Collection()
         self._ended = Flag()
         self._end: ExitReport | None = None
@@ -946,7 +947,9 @@ class System:
         page.stop()
         raise UsageError(f"system {self.name!r}: it was stopped while its web page started")
 
-    def record(self, file: str | os.PathLike[str] | None = None, *, limit: int = RECORDING_LIMIT) -> Recording:
+    def record(
+        self, file: str | os.PathLike[str] | None = None, *, limit: int = RECORDING_LIMIT, decisions: bool = False
+    ) -> Recording:
         """Begin to record what happens: events, exits, callbacks, and the messages between registrars.
 
         Use it as a context manager, or call its stop(). It ends with the system, too. Only a recording in progress has
@@ -956,14 +959,16 @@ class System:
             file: a new file to write it to, without a bound; None: it is in memory. A thread writes the file, and
                 misses entries if the disk is too slow.
             limit: how many entries are kept in memory; the oldest are dropped first.
+            decisions: have the registrars record all that they decide, for `rr-actors replay`. Such a recording has
+                whole requests and responses, and loads take longer meanwhile (docs/replay.md).
 
         Raises:
-            UsageError: the system does not run, or limit is no whole number above 0.
+            UsageError: the system does not run, limit is no whole number above 0, or decisions is no bool.
             ConfigError: the file exists already, or cannot be created.
         """
         self._running()
         path = None if file is None else Path(file)
-        recording = Recording(self.name, limit=limit, path=path, recordings=self._recordings)
+        recording = Recording(self.name, limit=limit, path=path, recordings=self._recordings, decisions=decisions)
         if (node := self._node) is None:  # the system was stopped meanwhile
             recording.stop()
             self._running()

@@ -5,10 +5,10 @@ from __future__ import annotations
 import functools
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
+from types import FrameType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -17,8 +17,12 @@ import rr_actors
 from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import CatalogError
 from rr_actors.base.values.failure import Failure
+from rr_actors.hosting.run_files import DECISIONS
 from rr_actors.registrar.core import holding
 from rr_actors.registrar.core.decide import Item
+from rr_actors.registrar.decisions.decided import Began
+from rr_actors.registrar.decisions.deciding_again import DecidedAgain
+from rr_actors.registrar.decisions.typed_values import value_from
 from rr_actors.registrar.engine.registrar_state import RegistrarState
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Catalog, Server
@@ -106,13 +110,20 @@ class KeptState(RegistrarState):
 class Stage:
     """A registrar's state, and what it has written."""
 
-    def __init__(self, before: list[Item]) -> None:
+    def __init__(self, before: list[Item], *, noted: bool = False) -> None:
         self.store = FullDisk()
+        self.texts: list[str] = []  # the notes of decisions
         loop: Any = Loop()
         workers: Any = None
-        self.state = KeptState("me", RegistrarConfig(name="me"), self.store, loop, workers)
+        watched: Any = SimpleNamespace(level=bytearray([DECISIONS if noted else 0]))
+        self.level: bytearray = watched.level
+        self.state = KeptState("me", RegistrarConfig(name="me"), self.store, loop, workers, watched, self._send)
         for item in before:
             self.state.commit([item])
+
+    def _send(self, _registrar: str, number: int, parts: Sequence[str]) -> bool:
+        self.texts.append("".join(parts))
+        return True
 
     def picture(self) -> dict[str, Any]:
         """What is known, in memory and on disk."""
@@ -220,6 +231,30 @@ def test_a_decision_that_cannot_be_written_and_is_interrupted_has_not_happened(n
         stage = Stage(before)
         interrupted(stage, item, place, full=True)
         assert_whole(stage, name, place)
+
+
+@SOME_OR_ALL
+@pytest.mark.parametrize("full", [False, True])
+@pytest.mark.parametrize("name", SCENES)
+def test_what_is_noted_of_a_decision_that_is_interrupted_leads_to_what_is_known(
+    name: str, full: bool, step: int
+) -> None:
+    before, item = SCENES[name]
+    count = interrupted(Stage(before, noted=True), item, full=full)
+    for place in range(1, count + 1, 31 * step):
+        stage = Stage(before, noted=True)
+        interrupted(stage, item, place, full=full)
+        stage.state.commit([tell(c.AddInFlight())])
+        stage.level[0] += 1  # another recording begins, and says what is known now
+        stage.state.commit([tell(c.AddInFlight())])
+        again = DecidedAgain()
+        for note in map(value_from, stage.texts):
+            if isinstance(note, Began):
+                assert again.begin(note) == (), f"{name}: interrupted at {place}"
+            else:
+                assert again.decide(note).differences == (), f"{name}: interrupted at {place}"
+                assert note.end == "raised" or again.is_known
+        assert note.items == [tell(c.AddInFlight())]
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -26,6 +26,7 @@ from rr_actors.base.errors import CatalogError, NotSerializable, UsageError, sho
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.failure import failure_of
 from rr_actors.hosting.process_node import ProcessNode
+from rr_actors.hosting.run_files import DECISIONS
 from rr_actors.registrar.core.decide import Item, refuse_uncommitted
 from rr_actors.registrar.engine.progress import ProgressListeners, ProgressReports
 from rr_actors.registrar.engine.registrar_state import RegistrarState
@@ -150,7 +151,8 @@ class RegistrarBase(RegistrarState, abc.ABC):
     def __init__(self, opening: Opening) -> None:
         self.node, name, config, store, self.peers, self.recorder, self.path = opening
         self.workers = self.node.dispatcher.workers
-        super().__init__(name, config, store, self.node.dispatcher.loop, self.workers)
+        loop, watched = self.node.dispatcher.loop, self.node.watched
+        super().__init__(name, config, store, loop, self.workers, watched, self.recorder.decision)
         self.commits.watched = self.node.watched
         self.gathers = not self.commits.row_by_row
         self.serving = False
@@ -312,8 +314,14 @@ class RegistrarBase(RegistrarState, abc.ABC):
 
     def _not_committed(self, items: Sequence[Item], error: CatalogError) -> None:
         """Refuse the items that can be refused, and put the others back, to be decided again a little later."""
-        refusals, again = refuse_uncommitted(self.whole(), items, failure_of(error))
+        noted = self.watched.level[0] >= DECISIONS
+        if noted:
+            self.notes.begin(self.whole(), items, self.watched.level[0])
+        failure = failure_of(error)
+        refusals, again = refuse_uncommitted(self.whole(), items, failure)
         refusals.close()  # this decision has effects only
+        if noted:
+            self.notes.refused(refusals, again, failure)
         self._effects.append(refusals.effects)
         if again:
             self.hold_up(again, _RETRY_S)

@@ -23,11 +23,13 @@ from typing import Protocol
 from rr_actors.actors.turns import TurnActor, may_be_interrupted
 from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import CatalogError, RegistrarDown, RrError
+from rr_actors.hosting.run_files import DECISIONS, Watched
 from rr_actors.registrar.core import holding
 from rr_actors.registrar.core.callback_runs import is_unwanted
 from rr_actors.registrar.core.decide import Item, decide
 from rr_actors.registrar.core.loads.loading import join
 from rr_actors.registrar.core.unloading import leave
+from rr_actors.registrar.decisions.decision_notes import DecisionNotes, Send
 from rr_actors.registrar.engine.commit_log import CommitLog
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import digests
@@ -86,13 +88,24 @@ class RegistrarState(TurnActor):
         sequence: the running numbers of queries, in the order in which they are asked for. Releases go newest first.
         loads, unloads: by query, the callback that hears how its load, or its release, ended.
         stops: by resource, phase and attempt of a callback that runs, the event that tells it to stop.
+        watched: who watches the system. While a recording wants decisions, all go by commit(), which notes them.
+        notes: the notes of them.
     """
 
     taken_by_senders = True
 
     def __init__(
-        self, name: str, config: RegistrarConfig, store: Store, loop: AbstractEventLoop, workers: Workers
+        self,
+        name: str,
+        config: RegistrarConfig,
+        store: Store,
+        loop: AbstractEventLoop,
+        workers: Workers,
+        watched: Watched,
+        send_note: Send,
     ) -> None:
+        self.watched = watched
+        self.notes = DecisionNotes(name, send_note)
         self.name = name
         self.config = config
         self.commits = CommitLog(name, config, store, loop, workers, self.lock)
@@ -132,6 +145,7 @@ class RegistrarState(TurnActor):
         catalog = self.catalog
         if catalog.unfinished is not None:
             self.commits.restore(catalog)
+            self.notes.doubt()
             catalog.unfinished = None
         return catalog
 
@@ -142,13 +156,25 @@ class RegistrarState(TurnActor):
             CatalogError: the changes were not written. Nothing has happened, and no other thread has seen any of it.
         """
         with self.lock:
-            decision = decide(self.whole(), items)
+            noted = self.watched.level[0] >= DECISIONS
+            if noted:
+                items = self.notes.begin(self.whole(), items, self.watched.level[0])
+            try:
+                decision = decide(self.whole(), items)
+            except Exception as error:
+                if noted:
+                    self.notes.raised(error)
+                raise
             try:
                 self.commits.commit(decision)
-            except CatalogError:
+            except CatalogError as error:
+                if noted:
+                    self.notes.undone(decision, error)
                 decision.undo()
                 raise
             decision.close()
+            if noted:
+                self.notes.committed(decision)
             if self._stops:
                 self._stop_unwanted(decision)
             if self._loads_over:
@@ -248,7 +274,7 @@ class RegistrarState(TurnActor):
             catalog = self.catalog
             if catalog.unfinished is not None:
                 self.whole()
-            query = None if self.waiting else join(catalog, load)
+            query = None if self.waiting or self.watched.level[0] >= DECISIONS else join(catalog, load)
             if query is None:
                 return None
             try:
@@ -288,7 +314,7 @@ class RegistrarState(TurnActor):
         """
         id, registrar, server, parent = query.id, query.registrar, query.server, query.parent
         attempt, seq = 0, next(self.sequence)
-        if self.catalog.shut:
+        if self.catalog.shut or self.watched.level[0] >= DECISIONS:
             return None
         if not parent:
             self.loads[id] = ended  # without the lock: the id is new, and each dict takes it in one step
@@ -318,7 +344,7 @@ class RegistrarState(TurnActor):
             catalog = self.catalog
             if catalog.unfinished is not None:
                 self.whole()
-            if self.waiting:
+            if self.waiting or self.watched.level[0] >= DECISIONS:
                 return False
             held = holding.hold(catalog, self.commits.unsaved, answer)
             if held:
@@ -349,7 +375,7 @@ class RegistrarState(TurnActor):
         if self.closed or may_be_interrupted():
             return False
         with self.lock:
-            if self.waiting or self.closed or query_id in self.unloads:
+            if self.waiting or self.closed or query_id in self.unloads or self.watched.level[0] >= DECISIONS:
                 return False
             catalog = self.catalog
             if catalog.unfinished is not None:
@@ -364,7 +390,7 @@ class RegistrarState(TurnActor):
         if self.closed:
             return False
         with self.lock:
-            if self.waiting:
+            if self.waiting or self.watched.level[0] >= DECISIONS:
                 return False
             catalog = self.catalog
             if catalog.unfinished is not None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import msgspec
@@ -17,7 +17,7 @@ import msgspec
 from rr_actors.actors.messaging.message_notes import Stamp
 from rr_actors.base.errors import Unavailable
 from rr_actors.registrar.model.messages import Message
-from rr_actors.registrar.model.recorded import Entry, message_entry
+from rr_actors.registrar.model.recorded import DECIDED, Entry, message_entry
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.runtime.thread_rules import on_loop
 
@@ -25,6 +25,8 @@ RECORDED = "recorded"
 """The event that carries a batch: "entries", encoded, and "dropped", the number of entries without room."""
 KEPT = 10_000
 """How many entries may wait for the loop. More are counted and dropped."""
+_TOGETHER = 200
+"""How many entries are sent in one message; those of a decision may be 64 KiB long."""
 BATCH_S = 0.01
 
 _encode = msgspec.msgpack.Encoder().encode
@@ -77,17 +79,28 @@ class Recorder:
         where = (self._path, self._pid, actor, peer)
         self._add(Entry(time.time(), event, 0, *where, stamp.kind, stamp.id, "", cause, "", text))
 
-    def _add(self, entry: Entry) -> None:
+    def decision(self, registrar: str, number: int, parts: Sequence[str]) -> bool:
+        """Record the note of this number about a decision of a registrar. Return False if there was no room for it."""
+        at, where = time.time(), (self._path, self._pid, registrar)
+        count = len(parts)
+        entries = [
+            Entry(at, DECIDED, 0, *where, facts={"number": number, "part": part, "parts": count, "note": text})
+            for part, text in enumerate(parts, 1)
+        ]
+        return self._add(*entries)
+
+    def _add(self, *entries: Entry) -> bool:
         with self._lock:
-            if len(self._waiting) >= KEPT:
-                self._dropped += 1
-                return
-            self._waiting.append(entry)
+            if len(self._waiting) + len(entries) > KEPT:
+                self._dropped += len(entries)
+                return False
+            self._waiting += entries
         if not self._scheduled:  # set by the loop: if a thread is interrupted here, the next entry does this
             try:
                 self._dispatcher.call(self._flush_soon)
             except Unavailable:  # the loop has ended, and nothing more can be sent
                 self._waiting.clear()
+        return True
 
     @on_loop
     def close(self) -> None:
@@ -107,7 +120,8 @@ class Recorder:
         with self._lock:
             waiting, self._waiting = self._waiting, []
             dropped, self._dropped = self._dropped, 0
-        self._emit(RECORDED, entries=_encode(waiting), dropped=dropped)
+        for at in range(0, max(1, len(waiting)), _TOGETHER):
+            self._emit(RECORDED, entries=_encode(waiting[at : at + _TOGETHER]), dropped=0 if at else dropped)
 
 
 def entries_of(event: dict[str, Any]) -> list[Entry]:

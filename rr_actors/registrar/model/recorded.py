@@ -17,6 +17,8 @@ from rr_actors.registrar.model import messages as m
 from rr_actors.registrar.model.messages import Message
 from rr_actors.registrar.model.rows import shown_priority
 
+DECIDED = "decided"
+"""The event of an entry that has a note about a decision, or a part of one (registrar/decisions)."""
 _LONG = 1000  # the bytes of a request that is shown, at most
 _PUT_BACK_S = 0.25  # by which the time of one source falls if the clock is put back; threads may be late by less
 
@@ -27,8 +29,9 @@ class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
     Attributes:
         seq: its number in the recording; 0 until it has one. Entries are numbered as they arrive.
         at: when it happened, in seconds since the epoch; not always in the order of `seq`.
-        event: "sent" or "received" for a message; "began" or "ended" for a callback. Otherwise an event of the tree or
-            of a resource, named as in System.subscribe(). A message between actors is "received" when its handler
+        event: "sent" or "received" for a message; "began" or "ended" for a callback; "decided" for a decision of a
+            registrar, if the recording has those. Otherwise an event of the tree or of a resource, named as in
+            System.subscribe(). A message between actors is "received" when its handler
             begins.
         process: the path of the process where it happened, "root/cameras"; `pid`: its process id.
         registrar: the registrar or actor where it happened. Code of no actor has the name of its process.

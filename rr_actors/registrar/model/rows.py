@@ -260,6 +260,12 @@ TABLES: dict[Table, type[Row]] = {
 }
 TABLE_OF: dict[type[Row], Table] = {cls: table for table, cls in TABLES.items()}
 
+
+def key_of_row(row: Row) -> tuple[Table, str]:
+    """Return the table and the id of a row."""
+    return TABLE_OF[type(row)], row.id
+
+
 Content = dict[Table, dict[str, Any]]
 """All rows of a catalog, by table and id. It has every table."""
 

@@ -164,13 +164,16 @@ class ConsoleConnection:
         """
         return self._parts(follow, tick_s)
 
-    def record(self) -> Iterator[c.Entries]:
+    def record(self, *, decisions: bool = False) -> Iterator[c.Entries]:
         """Yield the recorded entries from now on, as follow() does. `dropped` has those that this reader missed, too.
+
+        Args:
+            decisions: also those of what the registrars decide.
 
         Raises:
             RrError: the system refused the request.
         """
-        parts = self._parts(c.BeginRecording())
+        parts = self._parts(c.BeginRecording(decisions))
         return (c.Entries([], part.count) if isinstance(part, c.Missed) else part for part in parts)
 
     def _parts(self, request: c.Follow | c.BeginRecording, tick_s: float | None = None) -> Iterator[Any]:

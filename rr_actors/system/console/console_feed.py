@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 
 from rr_actors.base.errors import TEXT_LIMIT, NotSerializable, readable
-from rr_actors.registrar.model.recorded import Entry
+from rr_actors.registrar.model.recorded import DECIDED, Entry
 from rr_actors.system.console.console_messages import (
     ANSWER_LIMIT_BYTES,
     BeginRecording,
@@ -36,6 +36,7 @@ KEPT_OF_RECORDING = 50_000
 BATCH_S = 0.05
 """Seconds that an event waits for others, to be sent with them."""
 _BATCH = 500
+_NOTES = ANSWER_LIMIT_BYTES // 2  # characters of the notes of decisions in a batch
 _SHORT = 1000  # characters of a text, so that a batch of them fits into a frame
 
 
@@ -55,6 +56,7 @@ class Reader:
         self.is_blocked = False
         self.newest = 0
         self.records = isinstance(follow, BeginRecording)
+        self.wants_decisions = isinstance(follow, BeginRecording) and follow.decisions
         self._kept = KEPT_OF_RECORDING if self.records else KEPT
         wanted = Follow() if isinstance(follow, BeginRecording) else follow
         self._kinds = frozenset(wanted.events)
@@ -99,7 +101,8 @@ class Reader:
             self._fall_behind()
             return
         while self._waiting and not self.is_blocked:
-            batch, self._waiting = self._waiting[:_BATCH], self._waiting[_BATCH:]
+            count = _together(self._waiting)
+            batch, self._waiting = self._waiting[:count], self._waiting[count:]
             self._send(_entries(batch, self._dropped) if self.records else _events(batch))
             self._dropped = 0
 
@@ -142,7 +145,8 @@ class Feed:
         """Send a reader what happens from now on."""
         self._readers[reader] = None
         if reader.records:
-            self._readers[reader] = self._recordings.begin(functools.partial(self._recorded, reader))
+            sink = functools.partial(self._recorded, reader)
+            self._readers[reader] = self._recordings.begin(sink, decisions=reader.wants_decisions)
         elif self._unlisten is None:
             self._unlisten = self._subscribers.listen(self.heard)
 
@@ -183,6 +187,16 @@ class Feed:
             self._flush()
         for reader in self.readers:
             self.remove(reader)
+
+
+def _together(waiting: list[Event | Entry]) -> int:
+    """Return how many of those that wait are sent in one frame: of the long notes of decisions, fewer."""
+    size = 0
+    for count, what in enumerate(waiting[:_BATCH]):
+        size += len(what.facts.get("note", "")) if what.event == DECIDED else 0
+        if size > _NOTES and count:
+            return count
+    return _BATCH
 
 
 def _entries(entries: list[Any], dropped: int) -> bytes:

@@ -82,7 +82,12 @@ class Follow(Message, frozen=True):
 
 
 class BeginRecording(Message, frozen=True):
-    """Have everything recorded and sent from now on: events, callbacks, and the messages between registrars."""
+    """Have everything recorded and sent from now on: events, callbacks, and the messages between registrars.
+
+    `decisions`: what the registrars decide, too.
+    """
+
+    decisions: bool = False
 
 
 class Keep(Message, frozen=True):

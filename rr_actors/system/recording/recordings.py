@@ -25,7 +25,7 @@ from rr_actors.base.names import time_in
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.links.recorder import RECORDED, entries_of
-from rr_actors.registrar.model.recorded import Entry, in_order
+from rr_actors.registrar.model.recorded import DECIDED, Entry, in_order
 from rr_actors.registrar.pages import ResourceRow
 from rr_actors.registrar.queries import Query, ResourceInfo
 from rr_actors.system.recording.event_memory import Event
@@ -101,24 +101,33 @@ class Recordings:
 
     Args:
         record: a function that has its argument called for each event, and returns a function that ends this.
-        counters: get all entries, too.
+        want_decisions: has the registrars note their decisions, and returns a function that ends this.
+        counters: get all entries, too, except those of decisions.
     """
 
     def __init__(
-        self, record: Callable[[Callable[[dict[str, Any]], None]], Callable[[], None]], counters: Counters
+        self,
+        record: Callable[[Callable[[dict[str, Any]], None]], Callable[[], None]],
+        want_decisions: Callable[[], Callable[[], None]],
+        counters: Counters,
     ) -> None:
         self.seq = 0
         self._counters = counters
         self._record = record
+        self._want_decisions = want_decisions
         self._unrecord: Callable[[], None] | None = None
         self._sinks: dict[Sink, Callable[[], object] | None] = {}
+        self._of_decisions: dict[Sink, Callable[[], None]] = {}  # what ends that the registrars note them, by sink
         self._lock = threading.Lock()
 
-    def begin(self, sink: Sink, closed: Callable[[], object] | None = None) -> Callable[[], None]:
+    def begin(
+        self, sink: Sink, closed: Callable[[], object] | None = None, *, decisions: bool = False
+    ) -> Callable[[], None]:
         """Have the sink called with each new entry. From any thread.
 
         Args:
             closed: called if the system stops while the sink is in use.
+            decisions: have it called with those of decisions, too.
 
         Returns:
             A function that removes the sink. A second call does nothing.
@@ -127,11 +136,16 @@ class Recordings:
             self._sinks = {**self._sinks, sink: closed}
             if self._unrecord is None:
                 self._unrecord = self._record(self._heard)
+            if decisions:
+                self._of_decisions = {**self._of_decisions, sink: self._want_decisions()}
         return functools.partial(self._end, sink)
 
     def _end(self, sink: Sink) -> None:
         with self._lock:
             self._sinks = {other: closed for other, closed in self._sinks.items() if other is not sink}
+            if (unwant := self._of_decisions.get(sink)) is not None:
+                self._of_decisions = {other: end for other, end in self._of_decisions.items() if other is not sink}
+                unwant()
             if not self._sinks and self._unrecord is not None:
                 unrecord, self._unrecord = self._unrecord, None
                 unrecord()
@@ -167,9 +181,10 @@ class Recordings:
             entries = [entry_of(Event.of(event))]
         numbered = [msgspec.structs.replace(entry, seq=seq) for seq, entry in enumerate(entries, self.seq + 1)]
         self.seq += len(numbered)
-        self._counters.take(numbered)
+        others = [entry for entry in numbered if entry.event != DECIDED]
+        self._counters.take(others)
         for sink in self._sinks:
-            sink(numbered, dropped)
+            sink(numbered if sink in self._of_decisions else others, dropped)
 
 
 def entry_of(event: Event) -> Entry:
@@ -206,10 +221,18 @@ class Recording:
     """
 
     def __init__(
-        self, system: str, *, limit: int = LIMIT, path: Path | None = None, recordings: Recordings | None = None
+        self,
+        system: str,
+        *,
+        limit: int = LIMIT,
+        path: Path | None = None,
+        recordings: Recordings | None = None,
+        decisions: bool = False,
     ) -> None:
         if type(limit) is not int or limit < 1:
             raise UsageError(f"record: limit: expected a whole number above 0, got {shown(limit)}")
+        if type(decisions) is not bool:
+            raise UsageError(f"record: decisions: expected True or False, got {shown(decisions)}")
         self.system = system
         self.since = time.time()
         self.missed = 0
@@ -220,7 +243,8 @@ class Recording:
         self._entries: deque[Entry] = deque(maxlen=limit)
         self._pid = os.getpid()
         self._writer = None if path is None else _Writer(RecordingFile(path, system, self.since))
-        self._end = None if recordings is None else recordings.begin(self._take, self._closed)
+        begin = None if recordings is None else recordings.begin
+        self._end = None if begin is None else begin(self._take, self._closed, decisions=decisions)
 
     def _take(self, entries: list[Entry], dropped: int = 0) -> None:
         with self._lock:
@@ -269,12 +293,24 @@ class Recording:
         """Return the entries, oldest first. Those of the last tenth of a second may be missing.
 
         If the clock was put back meanwhile, what was recorded before that comes first, with its later times.
+        Those of decisions are not among them: replay() reads these.
 
         Raises:
             ConfigError: the recording's file cannot be read.
         """
+        return [entry for entry in self._all() if entry.event != DECIDED]
+
+    def decisions(self) -> list[Entry]:
+        """Return the entries of decisions, oldest first; replay() decides them again.
+
+        Raises:
+            ConfigError: the recording's file cannot be read.
+        """
+        return [entry for entry in self._all() if entry.event == DECIDED]
+
+    def _all(self) -> list[Entry]:
         if self.path is not None:
-            return read_recording(self.path).entries()
+            return read_recording(self.path)._all()
         with self._lock:
             return in_order(self._entries)
 
@@ -310,7 +346,7 @@ class Recording:
         Raises:
             ConfigError: the file is there already, or cannot be written.
         """
-        entries = self.entries()
+        entries = self._all()
         file = RecordingFile(Path(path), self.system, self.since)
         try:
             file.write([*_lines_of(self.present, self.since), *entries], self.missed)
@@ -320,7 +356,7 @@ class Recording:
             raise
 
     def __len__(self) -> int:
-        return len(self._entries) if self.path is None else len(self.entries())
+        return len(self._entries) if self.path is None else len(self._all())
 
     def __enter__(self) -> Self:
         return self

@@ -66,6 +66,9 @@ def record(
     seconds: Annotated[
         float | None, typer.Option(min=0.0, max=threading.TIMEOUT_MAX, help="End after this time. Default: at Ctrl-C.")
     ] = None,
+    decisions: Annotated[
+        bool, typer.Option("--decisions", help="Also all that registrars decide, for `replay`. Loads take longer.")
+    ] = False,
     state: StateOption = None,
 ) -> None:
     """Record the events, exits, callbacks and messages of the system: of its actors and registrars."""
@@ -74,7 +77,7 @@ def record(
         sink = RecordingFile(file, connection.welcome.system, time.time())
         try:
             with _ending(connection, seconds), suppress(KeyboardInterrupt):
-                parts = connection.record()
+                parts = connection.record(decisions=decisions)
                 sink.write(_present(state))
                 for part in parts:
                     missed += part.dropped

@@ -15,12 +15,24 @@ from rr_actors.base.errors import UsageError, counted, shown
 from rr_actors.registrar.model.rows import Held, priority_of
 from rr_actors.registrar.pages import priority_text
 from rr_actors.system.console.console_connection import find_console
+from rr_actors.system.rewound.decision_texts import facts_of, step_lines
+from rr_actors.system.rewound.replaying import replay as replay_of
 from rr_actors.system.rewound.rewind_times import time_meant
 from rr_actors.system.rewound.rewinding import Rewound
 from rr_actors.system.rewound.rewinding import rewind as rewound_of
-from rr_actors.tools.cli_commands import JsonOption, StateOption, WatchOption, say, say_json, say_table, shown_again
+from rr_actors.tools.cli_commands import (
+    JsonOption,
+    StateOption,
+    WatchOption,
+    say,
+    say_json,
+    say_lines,
+    say_table,
+    shown_again,
+)
 from rr_actors.tools.inspection import Contents, check_state, read_state, readable
 from rr_actors.tools.log_lines import printable
+from rr_actors.tools.tables import decision_tables as decided
 from rr_actors.tools.tables import moment_tables as then
 
 app = typer.Typer()
@@ -236,6 +248,52 @@ def rewind(
         _say_between(rewound, "start" if start is None else start, "end" if end is None else end, as_json)
     else:
         _say_moment(rewound, time_meant("end" if at is None else at, rewound.since, rewound.until), as_json)
+
+
+@app.command(epilog="Example: rr-actors replay fault.jsonl cameras --step 12")
+def replay(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A file of `record --decisions`.")],
+    registrar: Annotated[str, typer.Argument(help="List the decisions of this registrar, a line each.")] = "",
+    step: Annotated[int | None, typer.Option("--step", "-n", help="Show all of one decision.")] = None,
+    different: Annotated[
+        bool, typer.Option("--different", help="Show all of each decision that today's code decides in another way.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Decide again what registrars decided in a recording; exit code 1 if today's code decides in another way.
+
+    Without REGISTRAR it counts the decisions of each. With one, it lists them: what was decided, the rows that this
+    changed, and what followed. Nothing of the system is started, and no callback runs.
+    """
+    if step is not None and not registrar:
+        raise UsageError("replay: expected the name of a registrar before --step: rr-actors replay FILE cameras -n 12")
+    if step is not None and different:
+        raise UsageError("replay: expected one of --step and --different, got both")
+    found = replay_of(file)
+    steps = found.of(registrar) if registrar else [one for ones in found.steps.values() for one in ones]
+    if step is not None:
+        steps = [found.step(registrar, step)]
+    elif different:
+        steps = [one for one in steps if one.differences]
+    if as_json:
+        for one in steps:
+            say_json(facts_of(one))
+    else:
+        for caveat in decided.caveats_of(found):
+            say(caveat, err=True)
+        if step is not None or different:
+            say_lines("\n\n".join("\n".join(step_lines(one)) for one in steps))
+        elif registrar:
+            rows = [decided.step_cells(one) for one in steps]
+            styles = [decided.style_of_step(one) for one in steps]
+            say_table(
+                decided.STEP_HEADS, rows, gives_way=("effects", "changes", "what"), right=("step",), styles=styles
+            )
+        else:
+            rows = [decided.registrar_cells(name, ones) for name, ones in found.steps.items()]
+            say_table(decided.REGISTRAR_HEADS, rows, gives_way=("registrar",), right=decided.REGISTRAR_HEADS[3:])
+    if any(one.differences for one in steps):
+        raise typer.Exit(1)
 
 
 def _number(rewound: Rewound, text: str, option: str) -> int:

@@ -246,7 +246,11 @@ VERBS: dict[str, dict[Callable[[], ModuleType | Declaring], dict[str, str]]] = {
         _state: {
             "rewind": (
                 "Show the tree and the resources as they were at any moment of a recording; in a terminal, step by step"
-            )
+            ),
+            "replay": (
+                "Decide again what registrars decided in a recording; exit code 1 if today's code decides in another "
+                "way"
+            ),
         },
     },
     "Look into a state directory, whether its system runs or not": {
