@@ -33,6 +33,7 @@ from rr_actors.system.hosts.host_messages import (
     Exported,
     Exports,
     check_crosses,
+    check_exports,
     no_types,
 )
 from rr_actors.system.hosts.host_settings import Hosts, named_in, names_of
@@ -227,8 +228,7 @@ class _Run:
         """Keep a link to a host that is alive, by which it says what it exports."""
         since = asyncio.get_running_loop().time()
         while peer.places and not self._closing:
-            lost = asyncio.Event()
-            hearing = _Hearing(functools.partial(self._heard, peer), lost)
+            hearing = _Hearing(functools.partial(self._heard, peer))
             try:
                 await self._network.connect(peer.name, Hello(_HOSTS, peer.name, self._name, 0), hearing.attach)
             except ProtocolMismatch as error:
@@ -240,14 +240,16 @@ class _Run:
                 await asyncio.sleep(_AGAIN_S)
                 continue
             except RrError as error:
-                _log.info("%s: no link to host %s yet: %s", self._name, peer.name, error)
+                self._away(peer, f"no link to it: {error}")
                 await asyncio.sleep(_AGAIN_S)
                 continue
-            await lost.wait()
-            self._away(peer, "the link to it is lost")
+            await hearing.lost_event.wait()
+            self._away(peer, f"the link to it is lost{hearing.because}")
+            await asyncio.sleep(_AGAIN_S)
 
     def _heard(self, peer: _Peer, message: Exports) -> None:
         """Write what a host exports into the directory; then that it is up."""
+        check_exports(message)
         peer.exports = {one.name: one for one in message.exported}
         for name, one in peer.exports.items():
             self._write(peer, name, one)
@@ -266,9 +268,10 @@ class _Run:
 
     def _away(self, peer: _Peer, why: str) -> None:
         """Write that a host is not reachable; loads there wait, within their time limits."""
-        if peer.row.state == UNREACHABLE:
-            return
         peer.because = why
+        if peer.row.state == UNREACHABLE:
+            self._say_why(peer, why)
+            return
         self._set_row(peer, UNREACHABLE, why)
         for name in peer.exports:
             self._directory.mark(registrar_key(f"{peer.name}/{name}"), Presence.STARTING, away(peer.name, peer.row))
@@ -283,7 +286,7 @@ class _Run:
                 tried = self._tried(await self._network.reached())
                 for peer in self._peers.values():
                     if _is_away(peer):
-                        self._say_tried(peer, tried)
+                        self._say_why(peer, f"{peer.because}; {tried}")
             await asyncio.sleep(_LOOK_S)
 
     def _tried(self, reached: list[str]) -> str:
@@ -295,9 +298,10 @@ class _Run:
         ]
         return ", ".join(f"{what} {few(places)}" for what, places in said if places)
 
-    def _say_tried(self, peer: _Peer, tried: str) -> None:
+    def _say_why(self, peer: _Peer, why: str) -> None:
+        """Write another reason for a host's being away, also into the entries of its registrars."""
         before = away(peer.name, peer.row)
-        self._set_row(peer, UNREACHABLE, f"{peer.because}; {tried}")
+        self._set_row(peer, UNREACHABLE, why)
         if before == (now := away(peer.name, peer.row)):
             return
         for registrar in self._directory.other_hosts_registrars():
@@ -356,7 +360,7 @@ class _Run:
         host = self._told[link] = _sender(link)
         if self._exported is not None:
             link.send_now(self._exported.for_host(host))
-        return _Hearing(_refuse, asyncio.Event(), functools.partial(self._told.pop, link, None))
+        return _Hearing(_refuse, functools.partial(self._told.pop, link, None))
 
     def _attach_host(self, host: str, link: Link) -> Receiver:
         """Serve a consumer of another host, as which no third one may speak."""
@@ -401,8 +405,10 @@ class _Run:
 class _Hearing:
     """The receiver of a link between two gateways."""
 
-    def __init__(self, heard: Any, lost: asyncio.Event, ended: Any = None) -> None:
-        self._heard, self._lost, self._ended = heard, lost, ended
+    def __init__(self, heard: Any, ended: Any = None) -> None:
+        self._heard, self._ended = heard, ended
+        self.lost_event = asyncio.Event()
+        self.because = ""
 
     def attach(self, _link: Link) -> Receiver:
         return self
@@ -411,7 +417,8 @@ class _Hearing:
         self._heard(message)
 
     def lost(self, link: Link, reason: Exception | None) -> None:
-        self._lost.set()
+        self.because = f": {reason}" if reason is not None else ""
+        self.lost_event.set()
         if self._ended is not None:
             self._ended()
 

@@ -14,7 +14,8 @@ import msgspec
 from msgspec.structs import replace
 
 from rr_actors.base import pickling
-from rr_actors.base.errors import Unavailable
+from rr_actors.base.errors import InvalidName, Unavailable
+from rr_actors.base.names import check_name
 from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.model.messages import (
     Describe,
@@ -37,6 +38,7 @@ from rr_actors.registrar.model.messages import (
     UnloadRefused,
     WaitedFor,
 )
+from rr_actors.wire.name_service import Presence
 
 
 class Exported(msgspec.Struct, frozen=True, array_like=True):
@@ -52,6 +54,21 @@ class Exports(msgspec.Struct, frozen=True, array_like=True, tag=1):
     """All registrars that the receiver may load from. Sent at first, and after each change."""
 
     exported: list[Exported]
+
+
+_EXPORTS_LIMIT = 1000
+
+
+def check_exports(message: Exports) -> None:
+    """Raise Unavailable, which breaks the link, if this is nothing that a host may say of its registrars."""
+    if len(message.exported) > _EXPORTS_LIMIT:
+        raise Unavailable(f"it exports {len(message.exported)} registrars: expected {_EXPORTS_LIMIT} at most")
+    for one in message.exported:
+        try:
+            check_name(one.name)
+            Presence(one.status)
+        except (InvalidName, ValueError) as error:
+            raise Unavailable(f"it exports a registrar that none can be: {error}") from error
 
 
 TO_PROVIDER = frozenset({Load, Unload, Fetch, NoticesHandled, Probe, Gone, Reprioritise})

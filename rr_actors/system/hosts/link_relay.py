@@ -14,6 +14,7 @@ _log = Log(__name__)
 
 WAITING_LIMIT = 10_000
 """How many messages may wait until the other link is open."""
+_AGAIN_S = 0.2
 
 
 class _End:
@@ -73,8 +74,12 @@ class Relay:
             for message in waiting:
                 far.send(message)
             far.flush()
-        except RrError as error:
-            _log.info("no link of %s to %s: %s", hello.origin, hello.to, error)
+        except Exception as error:
+            if isinstance(error, RrError):
+                _log.info("no link of %s to %s: %s", hello.origin, hello.to, error)
+            else:
+                _log.exception("no link of %s to %s", hello.origin, hello.to)
+            await asyncio.sleep(_AGAIN_S)  # the other end of `near` opens another at once
             self.close()
 
     def _from_near(self, link: Link, message: Any) -> None:
@@ -111,9 +116,9 @@ class Relay:
         if self._closed:
             return
         self._closed = True
-        if self._far is None:
+        if self._opening is not asyncio.current_task():
             self._opening.cancel()
-        else:
+        if self._far is not None:
             self._far.close()
         self._near.close()
         self._ended(self)
