@@ -18,7 +18,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.registrar.model.messages import Describe, Load, Message
-from rr_actors.system.hosts.host_messages import Exported, Exports
+from rr_actors.system.hosts.host_messages import Beat, Beaten, Exported, Exports, GatewayMessage
 from rr_actors.system.recording.recordings import Recording
 from rr_actors.wire.hosts import zenoh_link
 from rr_actors.wire.hosts.zenoh_link import ZenohTransport
@@ -306,7 +306,7 @@ def test_a_port_that_is_taken_is_an_error_at_the_start(tmp_path: Path) -> None:
         pass
 
 
-MESSAGES = {"registrar": Message, "hosts": Exports}
+MESSAGES = {"registrar": Message, "hosts": GatewayMessage}
 
 
 def test_a_host_of_another_version_is_refused_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -328,7 +328,7 @@ def test_a_host_of_another_version_is_refused_by_name(tmp_path: Path, monkeypatc
         versions = threading.Thread(target=lambda: asyncio.run(be_old()))
         versions.start()
         try:
-            refused = "hosta speaks protocol 1, hostb speaks 99"
+            refused = "hosta speaks protocol 2, hostb speaks 99"
             until(lambda: any(i.state == "refused" and refused in i.why for i in a.hosts()), "hostb is refused")
             with pytest.raises(rr.ProtocolMismatch, match="install the same version"):
                 app.load("hostb/cameras/camera", "x")
@@ -397,7 +397,7 @@ def test_a_host_that_says_what_cannot_be_or_refuses_all_links_is_not_asked_witho
             raise rr.Unavailable("it does not want to")
 
         def attach(link: Link) -> Receiver:
-            asyncio.get_running_loop().call_soon(link.send_now, Exports(exported))
+            asyncio.get_running_loop().call_soon(link.send_now, Exports(exported, 10.0))
             return _Ignored()
 
         return Welcome(1), attach
@@ -425,10 +425,11 @@ def test_a_host_that_says_what_cannot_be_or_refuses_all_links_is_not_asked_witho
 
 
 class _Ignored:
-    """A receiver that does nothing."""
+    """A receiver that answers heartbeats alone."""
 
     def received(self, link: Link, message: object) -> None:
-        """Ignore it."""
+        if isinstance(message, Beat):
+            link.send_now(Beaten(message.number))
 
     def lost(self, link: Link, reason: Exception | None) -> None:
         """Ignore it."""

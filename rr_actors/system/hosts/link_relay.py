@@ -35,6 +35,7 @@ class Relay:
 
     Args:
         near: the link that was accepted.
+        epoch: the incarnation of the provider for which it was accepted.
         dial: opens the other link.
         forth: takes a message of the near link. Returns what goes out by the other; None: nothing does.
         back: the same for a message of the other link.
@@ -44,12 +45,14 @@ class Relay:
     def __init__(
         self,
         near: Link,
+        epoch: int,
         dial: Callable[[Attach], Awaitable[Link]],
         forth: Callable[[Link, Any], Any],
         back: Callable[[Link, Any], Any],
         ended: Callable[[Relay], None],
     ) -> None:
-        self._near, self._dial, self._forth, self._back, self._ended = near, dial, forth, back, ended
+        self._near, self._epoch, self._dial, self._ended = near, epoch, dial, ended
+        self._forth, self._back = forth, back
         self._far: Link | None = None
         self._waiting: list[Any] = []
         self._closed = False
@@ -68,7 +71,7 @@ class Relay:
                 far.close()
                 return
             self._far = far
-            if far.welcome.epoch != self._near.welcome.epoch:
+            if far.welcome.epoch != self._epoch:
                 raise Unavailable(f"{hello.to} has started again meanwhile")
             waiting, self._waiting = self._waiting, []
             for message in waiting:

@@ -45,7 +45,7 @@ from rr_actors.wire.unix_link import CLOSE_LIMIT_S, Wire
 
 _log = Log(__name__)
 
-PROTOCOL = 1
+PROTOCOL = 2
 """The version of what hosts say to each other."""
 OPENING_LIMIT_S = 5.0
 """How long the other side may take to answer an opening."""
