@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import socket
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -63,6 +66,72 @@ def cameras_at(state_dir: Path, listen: str, name: str = "hostb", to: tuple[str,
     """Return a system that exports cameras, not started."""
     hosts = rr.Hosts(name, listen=[listen], exports={"cameras": rr.Export(to=to)})
     return rr.System([rr.ChildSpec(Cameras, id="cameras")], state_dir=state_dir, hosts=hosts)
+
+
+class Proxy:
+    """A network between two hosts that can be held up: connect to `endpoint` to reach `target`."""
+
+    def __init__(self, target: str) -> None:
+        self._target = int(target.rpartition(":")[2])
+        self._flows = threading.Event()
+        self._flows.set()
+        self._closed = False
+        self._threads: list[threading.Thread] = []
+        self._sockets: list[socket.socket] = []
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.endpoint = f"tcp/127.0.0.1:{self._server.getsockname()[1]}"
+        self._begin(self._accept)
+
+    def _begin(self, run: Callable[..., None], *arguments: object) -> None:
+        self._threads.append(threading.Thread(target=run, args=arguments))
+        self._threads[-1].start()
+
+    def _accept(self) -> None:
+        while not self._closed:
+            try:
+                near, _ = self._server.accept()
+                self._sockets.append(near)
+                far = socket.create_connection(("127.0.0.1", self._target))
+            except OSError:
+                if self._sockets:
+                    self._sockets[-1].close()
+                continue
+            self._sockets.append(far)
+            self._begin(self._pass_on, near, far)
+            self._begin(self._pass_on, far, near)
+
+    def _pass_on(self, near: socket.socket, far: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while data := near.recv(65536):
+                self._flows.wait()
+                far.sendall(data)
+        for one in (near, far):
+            with contextlib.suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+
+    def hold(self) -> None:
+        """Bring nothing on, in both directions, until go(); nothing is lost."""
+        self._flows.clear()
+
+    def go(self) -> None:
+        """Bring on what was held up, and what comes."""
+        self._flows.set()
+
+    def __enter__(self) -> Proxy:
+        return self
+
+    def __exit__(self, *_raised: object) -> None:
+        self._closed = True
+        self.go()
+        with contextlib.suppress(OSError):
+            self._server.shutdown(socket.SHUT_RDWR)
+        self._server.close()
+        for one in self._sockets:
+            with contextlib.suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+            one.close()
+        for thread in self._threads:
+            thread.join()
 
 
 def until(condition: Callable[[], bool], what: str, limit_s: float = 30.0) -> None:

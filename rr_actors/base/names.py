@@ -40,6 +40,11 @@ NAME_RULE = "1 to 64 ASCII letters, digits, '_', '-' or '.', not starting with '
 _NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_\-.]{0,63}\Z")
 
 
+def is_of_another_host(registrar: str) -> bool:
+    """Return whether this is the name of a registrar of another host, "hostb/cameras"."""
+    return "/" in registrar
+
+
 class ServerId(NamedTuple):
     """A server's address: the registrar it belongs to ("cameras", or "hostb/cameras") and its name there."""
 

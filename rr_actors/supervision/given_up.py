@@ -13,6 +13,7 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 from rr_actors.base.config import RegistrarConfig
+from rr_actors.base.names import is_of_another_host
 from rr_actors.base.reporting.log import Log
 from rr_actors.registrar.core.releasing import forgetting, owing
 from rr_actors.registrar.engine.node import Node
@@ -48,7 +49,8 @@ async def give_up(node: Node, name: str, *, clear: bool = False, erase: bool = F
     await node.dispatcher.workers.run(owe, config, state_dir)
     told = await node.retire(name)
     down = {other for other, status in node.statuses().items() if status is not Presence.UP or other not in told}
-    await node.dispatcher.workers.run(functools.partial(forget, config, state_dir, down=down, clear=clear, erase=erase))
+    forgets = functools.partial(forget, config, state_dir, down=down, told=told, clear=clear, erase=erase)
+    await node.dispatcher.workers.run(forgets)
 
 
 def owe(config: RegistrarConfig, state_dir: Path) -> None:
@@ -61,12 +63,19 @@ def owe(config: RegistrarConfig, state_dir: Path) -> None:
 
 
 def forget(
-    config: RegistrarConfig, state_dir: Path, *, down: Collection[str] = (), clear: bool = False, erase: bool = False
+    config: RegistrarConfig,
+    state_dir: Path,
+    *,
+    down: Collection[str] = (),
+    told: Collection[str] = (),
+    clear: bool = False,
+    erase: bool = False,
 ) -> None:
     """Commit what releasing.forgetting() says. A catalog that then has nothing to be missed is removed. Blocks.
 
     Args:
-        down: the registrars that have not decided that this one is gone.
+        down: the registrars of this host that have not decided that this one is gone.
+        told: those of this host and others that have.
         clear: delete what it serves, too.
         erase: remove the catalog from disk, too.
 
@@ -80,7 +89,9 @@ def forget(
             if clear:
                 what = "is forgotten, and no unload callback has run"
             logger.warning("registrar %s: %s; what it serves %s", config.name, contents(rows_of(content)), what)
-        return forgetting(content, config.name, down, clear=clear)
+        asked = {*(row.registrar for row in content["held"].values()), *content["peers"]}
+        away = {peer for peer in asked if is_of_another_host(peer) and peer not in told}
+        return forgetting(content, config.name, {*down, *away}, clear=clear)
 
     change(config, state_dir, changes, erase=erase, unneeded=config.location is None)
 
@@ -97,7 +108,8 @@ def change(
     """Commit changes to a catalog that nobody has open. Blocks.
 
     Args:
-        erase: remove the catalog then; `unneeded`: if it has nothing to be missed.
+        erase: remove the catalog then, unless it owes releases at other hosts.
+        unneeded: remove it if it has nothing to be missed.
         formerly: the name of its registrar in earlier runs, which it may have.
 
     Raises:
@@ -114,7 +126,9 @@ def change(
     except BaseException:
         store.close()
         raise
-    store.close(erase=erase or (unneeded and not is_needed(content)))
+    asked = [*content["peers"], *(row.registrar for row in content["held"].values())]
+    owes_hosts = any(map(is_of_another_host, asked))  # they cannot see that the catalog is gone
+    store.close(erase=(erase and not owes_hosts) or (unneeded and not is_needed(content)))
 
 
 def contents(rows: Sequence[Row]) -> str:

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from rr_actors.base.config import CATALOG_FILE, RegistrarConfig, SystemConfig, called
 from rr_actors.base.errors import CatalogError, CatalogLocked, ConfigError, NameTaken, RrError, is_a
-from rr_actors.base.names import CONNECTED, check_name
+from rr_actors.base.names import CONNECTED, check_name, is_of_another_host
 from rr_actors.base.reporting.log import Log
 from rr_actors.registrar.engine.node import Node
 from rr_actors.registrar.model.rows import (
@@ -119,8 +119,10 @@ def left_behind(config: SystemConfig, state_dir: Path, except_for: set[str]) -> 
             continue
         try:
             rows = read_rows(catalog)
-            peers = [config.registrar(row.id).catalog_path(state_dir) for row in rows if isinstance(row, Peer)]
-            there = any(isinstance(row, Held | Resource | Notice) for row in rows)
+            asked = [row.id for row in rows if isinstance(row, Peer)]
+            peers = [config.registrar(peer).catalog_path(state_dir) for peer in asked if not is_of_another_host(peer)]
+            # Those of other hosts may have something: their catalogs are not here.
+            there = len(peers) < len(asked) or any(isinstance(row, Held | Resource | Notice) for row in rows)
             if there or name.startswith(CONNECTED) or any(_has_something(peer, name) for peer in peers):
                 found[name] = contents(rows)
                 if not name.startswith(

@@ -16,6 +16,7 @@ from typing import TypeVar
 
 from rr_actors.base.config import CATALOG_FILE
 from rr_actors.base.errors import CatalogError, ConfigError
+from rr_actors.base.names import is_of_another_host
 from rr_actors.base.values.canonical import shown_plain
 from rr_actors.registrar.model.rows import (
     RESTING,
@@ -154,9 +155,9 @@ def check_state(state_dir: str | os.PathLike[str]) -> list[str]:
 def check(state: Mapping[str, Contents]) -> list[str]:
     """Return a sentence for each violation between these catalogs.
 
+    Catalogs of other hosts are not there, so what is held there, and by them, is taken to be right.
     Rows that a crash may leave and the next start settles are no violations: a provider's query that its origin does
     not know yet, if the origin knows that provider; a release that is owed; a load that has not been answered.
-    Registrars of other hosts are not compared.
     """
     return sorted(
         violation
@@ -193,7 +194,7 @@ def _check_queries(contents: Contents, state: Mapping[str, Contents]) -> Iterato
         if query.resource_id not in contents.resources:
             yield f"{what} points to resource {query.resource_id}, which does not exist"
         origin = state.get(query.origin)
-        if _is_elsewhere(query.origin):
+        if is_of_another_host(query.origin):
             continue
         if origin is None:
             yield f"{what} belongs to a registrar without a catalog here"
@@ -207,7 +208,11 @@ def _check_held(contents: Contents, state: Mapping[str, Contents]) -> Iterator[s
         if held.parent and held.hold is not Hold.OWED and held.parent not in contents.resources:
             yield f"{what} belongs to resource {held.parent}, which does not exist"
         provider = state.get(held.registrar)
-        if held.hold is not Hold.HELD or (provider is not None and provider.damage) or _is_elsewhere(held.registrar):
+        if (
+            held.hold is not Hold.HELD
+            or (provider is not None and provider.damage)
+            or is_of_another_host(held.registrar)
+        ):
             continue
         if provider is None:
             yield f"{what} is on {held.registrar}/{held.server}, a registrar without a catalog here"
@@ -223,11 +228,6 @@ def _check_notices(contents: Contents) -> Iterator[str]:
             yield f"{contents.name}: notice {notice.id} is about query {notice.query_id}, which does not exist"
 
 
-def _is_elsewhere(registrar: str) -> bool:
-    """Return whether a registrar is another host's, "hostb/cameras", whose catalogs are not here."""
-    return "/" in registrar
-
-
 def check_delivered(state: Mapping[str, Contents], down: Collection[str] = ()) -> Iterator[str]:
     """Yield a sentence for each row that one of two registrars lacks or owes, if neither of them is `down`.
 
@@ -238,7 +238,7 @@ def check_delivered(state: Mapping[str, Contents], down: Collection[str] = ()) -
         for query in contents.queries.values():
             resource = contents.resources.get(query.resource_id)
             is_moving = resource is not None and resource.phase not in (Phase.LOADED, *RESTING)
-            if query.origin in down or is_moving or _is_elsewhere(query.origin):
+            if query.origin in down or is_moving or is_of_another_host(query.origin):
                 continue
             origin = state.get(query.origin)
             mine = origin.held.get(query.id) if origin is not None else None
@@ -247,10 +247,10 @@ def check_delivered(state: Mapping[str, Contents], down: Collection[str] = ()) -
             elif mine.hold is Hold.HELD and (mine.resource_id, mine.parent) != (query.resource_id, query.parent):
                 yield f"{name}: query {query.id} is on another resource, or for another, than {query.origin} says"
         for held in contents.held.values():
-            if held.hold is Hold.OWED and held.registrar not in down and not _is_elsewhere(held.registrar):
+            if held.hold is Hold.OWED and held.registrar not in down and not is_of_another_host(held.registrar):
                 yield f"{name}: its query {held.id} at {held.registrar} is {held.hold}"
         for notice in contents.notices.values():
-            if notice.origin not in down and not _is_elsewhere(notice.origin):
+            if notice.origin not in down and not is_of_another_host(notice.origin):
                 whom = notice.origin or f"the server of resource {notice.resource_id}"
                 yield f"{name}: notice {notice.id} for {whom} is not delivered"
 

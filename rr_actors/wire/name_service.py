@@ -162,6 +162,13 @@ class OtherHosts(Protocol):
         """Return the host of a registrar if that is another one, and not reachable now."""
         ...
 
+    def lease(self, state_dir: str, registrar: str) -> tuple[int, float] | None:
+        """Return the number of the lease at the host of a registrar, and how many seconds it goes on.
+
+        None: that registrar is of this host, or it releases nothing when a lease ends.
+        """
+        ...
+
 
 _AWAY = (Presence.GONE, Presence.DORMANT)
 _MARKS = {

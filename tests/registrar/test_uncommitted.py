@@ -21,6 +21,7 @@ from rr_actors.registrar.model.messages import (
     Fetch,
     Fetched,
     Gone,
+    Leased,
     Load,
     Loaded,
     LoadRefused,
@@ -29,6 +30,7 @@ from rr_actors.registrar.model.messages import (
     NoticesHandled,
     Probe,
     Progressed,
+    Released,
     Reprioritise,
     Reprioritised,
     Unload,
@@ -106,6 +108,7 @@ AGAIN: list[Any] = [
     Probe("served", "r", "served", []),
     WaitedFor("mine", "r", "served", []),
     Gone("app"),
+    Leased(["hostb"], 1),
     Reprioritise("served", "app", 5),
     Reprioritised("mine", 5),
     c.Got("mine", "r", b"feed"),
@@ -143,6 +146,7 @@ AGAIN: list[Any] = [
     c.ConsumerLost("app"),
     c.LinkLost("p"),
     c.PeerGone("p", LATE, True, "event"),
+    c.LeaseOver("p", 1, "over", "event"),
     c.BeginClosing(LATE),
     c.EndClosing(),
     c.EndProcess(),
@@ -178,7 +182,7 @@ def test_what_nobody_can_be_refused_is_done_again(item: Any) -> None:
 
 def test_every_message_and_command_is_in_one_of_these_tables() -> None:
     known = {type(item) for item in (*(item for item, _ in TOLD), *AGAIN, ask())}
-    for_clients = {Fetched, Described, Progressed}  # they come to no registrar's inbox
+    for_clients = {Fetched, Described, Progressed, Released}  # they come to no registrar's inbox
     assert known == {*get_args(Message), *c.Command.__subclasses__()} - for_clients
 
 

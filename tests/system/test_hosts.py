@@ -18,11 +18,11 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.registrar.model.messages import Describe, Load, Message
-from rr_actors.system.hosts.host_messages import Exports
+from rr_actors.system.hosts.host_messages import Beat, Beaten, Exported, Exports, GatewayMessage
 from rr_actors.system.recording.recordings import Recording
 from rr_actors.wire.hosts import zenoh_link
 from rr_actors.wire.hosts.zenoh_link import ZenohTransport
-from rr_actors.wire.transport import Hello
+from rr_actors.wire.transport import Attach, Hello, Link, Receiver, Welcome
 from support import TEST_PATHS, kill
 from support_cli import run_cli
 from support_hosts import Cameras, Loops, Maps, Warmed, cameras_at, endpoint, until
@@ -306,7 +306,7 @@ def test_a_port_that_is_taken_is_an_error_at_the_start(tmp_path: Path) -> None:
         pass
 
 
-MESSAGES = {"registrar": Message, "hosts": Exports}
+MESSAGES = {"registrar": Message, "hosts": GatewayMessage}
 
 
 def test_a_host_of_another_version_is_refused_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -328,7 +328,7 @@ def test_a_host_of_another_version_is_refused_by_name(tmp_path: Path, monkeypatc
         versions = threading.Thread(target=lambda: asyncio.run(be_old()))
         versions.start()
         try:
-            refused = "hosta speaks protocol 1, hostb speaks 99"
+            refused = "hosta speaks protocol 2, hostb speaks 99"
             until(lambda: any(i.state == "refused" and refused in i.why for i in a.hosts()), "hostb is refused")
             with pytest.raises(rr.ProtocolMismatch, match="install the same version"):
                 app.load("hostb/cameras/camera", "x")
@@ -373,6 +373,66 @@ def test_what_another_host_may_not_say_is_refused(
         said = asyncio.run(be_strange())
         assert resources(b) == []
     assert why in said
+
+
+@pytest.mark.parametrize(
+    ("exported", "why"),
+    [
+        ([Exported("../x", "up", 1, "")], r"a registrar that none can be: name '\.\./x'"),
+        ([Exported("x", "there", 1, "")], "a registrar that none can be: 'there'"),
+        ([Exported(f"x{number}", "up", 1, "") for number in range(1001)], "1001 registrars: expected 1000 at most"),
+        ([Exported("x", "up", 1, "")], ""),
+    ],
+    ids=["name", "status", "many", "refuses"],
+)
+def test_a_host_that_says_what_cannot_be_or_refuses_all_links_is_not_asked_without_a_pause(
+    tmp_path: Path, exported: list[Exported], why: str
+) -> None:
+    listen, asked = endpoint(), [0]
+    ended = threading.Event()
+
+    def accept(hello: Hello) -> tuple[Welcome, Attach]:
+        asked[0] += 1
+        if hello.kind != "hosts":
+            raise rr.Unavailable("it does not want to")
+
+        def attach(link: Link) -> Receiver:
+            asyncio.get_running_loop().call_soon(link.send_now, Exports(exported, 10.0))
+            return _Ignored()
+
+        return Welcome(1), attach
+
+    async def be_strange() -> None:
+        network = ZenohTransport("rr", "hostx", MESSAGES, connect=[listen])
+        try:
+            await network.listen(accept)
+            await asyncio.get_running_loop().run_in_executor(None, ended.wait, LIMIT_S)
+        finally:
+            await network.close()
+
+    with rr.System([], state_dir=tmp_path / "a", hosts=rr.Hosts("hosta", listen=[listen])) as a:
+        strange = threading.Thread(target=lambda: asyncio.run(be_strange()))
+        strange.start()
+        try:
+            until(functools.partial(says, a, why) if why else functools.partial(is_up, a, "hostx"), why, LIMIT_S)
+            with pytest.raises(rr.LoadTimeout):
+                a.open_registrar("app").load("hostx/x/y", 1, timeout_s=1)
+            assert asked[0] < 20 if why else asked[0] < 40
+        finally:
+            ended.set()
+            strange.join(LIMIT_S)
+        assert not strange.is_alive()
+
+
+class _Ignored:
+    """A receiver that answers heartbeats alone."""
+
+    def received(self, link: Link, message: object) -> None:
+        if isinstance(message, Beat):
+            link.send_now(Beaten(message.number))
+
+    def lost(self, link: Link, reason: Exception | None) -> None:
+        """Ignore it."""
 
 
 def test_of_two_systems_with_one_name_the_second_is_refused_until_the_first_has_gone(tmp_path: Path) -> None:

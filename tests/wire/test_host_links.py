@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import signal
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -207,5 +209,80 @@ def test_a_port_that_is_taken_is_named() -> None:
         finally:
             await second.close()
             await first.close()
+
+    asyncio.run(scenario())
+
+
+FROZEN = """
+import asyncio, sys
+from rr_actors.wire.hosts.zenoh_link import ZenohTransport
+from rr_actors.wire.transport import Welcome
+from support_transports import Inbox, Note
+
+async def main():
+    transport = ZenohTransport("group", sys.argv[1], {"registrar": Note}, connect=[sys.argv[2]])
+    echo = lambda link, note: link.send_now(Note(note.number))
+    await transport.listen(lambda hello: (Welcome(1), Inbox(echo).attach))
+    print("ready", flush=True)
+    await asyncio.Event().wait()
+
+asyncio.run(main())
+"""
+HELD_UP_S = 3.5
+"""Zenoh gives a call to a host that reads nothing up after 5 s."""
+
+
+def test_a_host_that_is_frozen_holds_up_no_other() -> None:
+    async def scenario() -> None:
+        endpoint = f"tcp/127.0.0.1:{free_port()}"
+        transport = ZenohTransport("group", "hosta", {"registrar": Note}, listen=[endpoint])
+        await transport.listen(Door())
+        peers: list[asyncio.subprocess.Process] = []
+        try:
+            for name in ("hostb", "hostc"):
+                program = (sys.executable, "-c", FROZEN, name, endpoint)
+                pipe = asyncio.subprocess.PIPE
+                env = os.environ | {"PYTHONPATH": TEST_PATHS}
+                peers.append(await asyncio.create_subprocess_exec(*program, stdout=pipe, env=env))
+                out = peers[-1].stdout
+                assert out is not None
+                assert await out.readline() == b"ready\n"
+            links = [await transport.connect("hostb", HELLO, Inbox().attach) for _ in range(16)]
+            answers = Inbox()
+            link = await transport.connect("hostc", HELLO, answers.attach)
+            peers[0].send_signal(signal.SIGSTOP)
+            for one in links:
+                one.send_now(Note(1, bytes(WINDOW_BYTES)))
+            began = time.monotonic()
+            for number in range(1, 40):
+                link.send_now(Note(number))
+                await answers.messages_are(number)
+            assert time.monotonic() - began < HELD_UP_S
+        finally:
+            for peer in peers:
+                peer.kill()
+                await peer.wait()
+            await transport.close()
+
+    asyncio.run(scenario())
+
+
+def test_a_link_that_has_ended_at_the_other_side_alone_is_lost_with_the_first_message() -> None:
+    async def scenario() -> None:
+        endpoint = f"tcp/127.0.0.1:{free_port()}"
+        door, inbox = Door(), Inbox()
+        one = ZenohTransport("group", "hosta", {"registrar": Note}, listen=[endpoint])
+        other = ZenohTransport("group", "hostb", {"registrar": Note}, connect=[endpoint])
+        try:
+            await one.listen(door)
+            link = await other.connect("hosta", HELLO, inbox.attach)
+            there = (await door.opened()).link
+            assert isinstance(there, HostLink)
+            there.end(None)  # as though the network had said that hostb is gone, and hostb had heard nothing
+            link.send_now(Note(1))
+            assert "has ended at this side" in str(await inbox.is_lost())
+        finally:
+            await other.close()
+            await one.close()
 
     asyncio.run(scenario())

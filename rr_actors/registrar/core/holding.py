@@ -99,6 +99,9 @@ def got(decision: Decision, command: Got) -> None:
         taken = _unknown(id)
         decision.cause(LoadResolved(replace(taken, resource_id=command.resource_id, response=command.response), None))
         return
+    if held.hold is PENDING and 0 < command.run <= catalog.lapsed.get(held.registrar, 0):
+        decision.request(held.registrar, load_of(decision, held))  # the answer is of a lease that is over
+        return
     if held.registrar not in catalog.up:
         decision.note(catalog.fresh, id, command.run)
         decision.cause(Connect(held.registrar))

@@ -6,7 +6,7 @@ It lives on the process's loop, with its servers and clients. Nothing here block
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 from rr_actors.actors.messaging.exit_reports import ExitReport, abnormal
 from rr_actors.actors.turns import CLOSED
@@ -175,6 +175,9 @@ class RegistrarActor(RegistrarBase):
 
     def expel(self, origin: str) -> None:
         self.consumers.expel(origin)
+
+    def fence(self, hosts: Collection[str]) -> None:
+        self.consumers.fence(hosts)
 
     def described(self, server: str, types: bytes) -> None:
         self.types.described(server, types)

@@ -17,7 +17,7 @@ from __future__ import annotations
 import abc
 import asyncio
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 from rr_actors.actors.turns import Delivery, may_be_interrupted, runs_handlers
@@ -34,7 +34,7 @@ from rr_actors.registrar.engine.status import StatusMessage
 from rr_actors.registrar.links.recorder import Recorder
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.effects import AnswerCall, Effect
-from rr_actors.registrar.model.messages import Gone, Load, Loaded, LoadRefused, Message, Noticed
+from rr_actors.registrar.model.messages import Gone, Leased, Load, Loaded, LoadRefused, Message, Noticed
 from rr_actors.registrar.model.rows import Change, Held, Notice, Resource
 from rr_actors.registrar.model.store import Store
 from rr_actors.registrar.servers.part_times import PartTimes
@@ -189,6 +189,8 @@ class RegistrarBase(RegistrarState, abc.ABC):
             return
         if type(message) is Gone:
             self.expel(message.origin)
+        elif type(message) is Leased:
+            self.fence(message.hosts)
         self.deliver(message, sender, more=more)
 
     @on_loop
@@ -355,6 +357,10 @@ class RegistrarBase(RegistrarState, abc.ABC):
     @abc.abstractmethod
     def expel(self, origin: str) -> None:
         """Close the links of a consumer that does not come back, and ignore their messages."""
+
+    @abc.abstractmethod
+    def fence(self, hosts: Collection[str]) -> None:
+        """Close the links of consumers of all hosts but these, and ignore their messages."""
 
     @abc.abstractmethod
     def refusal(self, loaded: Loaded, error: NotSerializable) -> LoadRefused:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Collection, Container, Sequence
 from typing import Any
 
 import msgspec
@@ -13,6 +13,7 @@ from msgspec.structs import replace
 from rr_actors.actors.turns import may_be_interrupted
 from rr_actors.base.errors import NotSerializable, RrError, Unavailable, shown
 from rr_actors.base.reporting.log import Log
+from rr_actors.registrar.core.leases import is_fenced
 from rr_actors.registrar.engine.registrar_base import RegistrarBase
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.messages import (
@@ -20,6 +21,7 @@ from rr_actors.registrar.model.messages import (
     Fetch,
     Fetched,
     Gone,
+    Leased,
     Load,
     Loaded,
     LoadRefused,
@@ -38,6 +40,9 @@ from rr_actors.wire.transport import Hello, Link
 
 logger = Log("rr_actors.registrar")
 
+GATEWAY = retired("hosts")
+"""The origin of the link by which the gateway of this host says which other hosts have a lease."""
+
 _OF_ITSELF = frozenset({Load, Unload, Fetch, Gone, Reprioritise})  # messages in which a consumer names itself
 _A_CONSUMERS = frozenset({Describe, NoticesHandled, Probe})  # the other messages that a consumer may send
 
@@ -49,6 +54,7 @@ class Consumers:
     def __init__(self, provider: RegistrarBase) -> None:
         self._provider = provider
         self._links: dict[str, Link] = {}
+        self._host_lines: dict[str, set[Link]] = {}  # the direct lines of consumers of other hosts
         self.routes = Routes()  # for each answer, the line or link by which it goes
         self.unflushed: dict[int, Any] = {}  # the links that have unsent messages
         self._side: dict[type[Any], Callable[[str, Any], None]] = {}  # messages of consumers that are not decided
@@ -63,8 +69,10 @@ class Consumers:
             self._lost(origin)
         return _Inlet(self.received, self.lost)
 
-    def attach_direct(self, _line: Link) -> _Inlet:
+    def attach_direct(self, line: Link) -> _Inlet:
         """Take a direct line of a consumer's thread."""
+        if "/" in line.hello.origin:
+            self._host_lines.setdefault(line.hello.origin, set()).add(line)
         return _Inlet(self.received_directly, self.lost_directly)
 
     def send(self, origin: str, message: Message) -> None:
@@ -193,6 +201,14 @@ class Consumers:
             link.close()
             self._lost(origin)
 
+    def fence(self, hosts: Collection[str]) -> None:
+        """Close the links and lines of all hosts that have no lease: what is still on its way there does nothing."""
+        for origin in {*self._links, *self._host_lines}:
+            if is_fenced(origin, hosts):
+                for line in self._host_lines.pop(origin, ()):
+                    line.close()
+                self.expel(origin)
+
     def lost(self, link: Link, _reason: Exception | None) -> None:
         """Note that the link of a consumer is down."""
         origin = link.hello.origin
@@ -254,6 +270,10 @@ class Consumers:
     def lost_directly(self, line: Any, _reason: Exception | None) -> None:
         """Note that a direct line is down: the consumer's link carries the answers that it waits for."""
         self.routes.line_lost(line)
+        if (lines := self._host_lines.get(line.hello.origin)) is not None:
+            lines.discard(line)
+            if not lines:
+                del self._host_lines[line.hello.origin]
 
     def close(self) -> None:
         """Close every link and line."""
@@ -269,7 +289,7 @@ def _check(message: Any, origin: str) -> None:
     if type(message) in _OF_ITSELF:
         if message.origin != origin and not (type(message) is Gone and origin == retired(message.origin)):
             raise Unavailable(f"{type(message).__name__} of {shown(message.origin)} on a link of {origin!r}")
-    elif type(message) not in _A_CONSUMERS:
+    elif type(message) not in _A_CONSUMERS and not (type(message) is Leased and origin == GATEWAY):
         raise Unavailable(f"{type(message).__name__} is a provider's to say, not a consumer's")
 
 

@@ -69,6 +69,9 @@ _STARTING_RETRY_S = 0.01  # the longest wait after a provider is up; to look int
 _STOPPED_RETRY_S = 0.25
 _STAYS_DOWN_S = {Presence.STOPPED: 0.2, Presence.DORMANT: 1.0}  # else it may be between two starts: an import, at most
 _WRITE_AGAIN_S = 0.25
+_LOOK_AT_LEASE_S = 1.0  # at least so often: the loop's timers stand still while the machine sleeps
+LEASE_BITS = 32
+"""The epoch of a provider of another host has its own epoch below these bits, and the number of the lease above."""
 
 _ANSWERS = frozenset({Loaded, LoadRefused, Unloaded, UnloadRefused, Reprioritised, WaitedFor})
 _A_PROVIDERS = _ANSWERS | {Fetched, Noticed}  # and the side messages (ProviderLink)
@@ -128,6 +131,11 @@ class ProviderLink(TurnActor):
             Progressed: self._hear_progress,
         }
         self._unflushed: Link | None = None  # a link with unsent requests
+        self._run = 0  # the epoch of the provider in the last link
+        self._lease = 0  # the number of the lease under which something may be held; 0: none
+        self._lease_timer: asyncio.TimerHandle | None = None
+        if self._node.info.hosts is not None and "/" in provider:  # something may be held from before a crash
+            self._node.dispatcher.loop.call_soon_threadsafe(self._watch_lease)
 
     # -- the handler ---------------------------------------------------------------------------------------------
 
@@ -278,6 +286,8 @@ class ProviderLink(TurnActor):
             self._task = None
         self._drop_link()
         self._end_fetches(self._registrar.down())
+        if self._lease_timer is not None:
+            self._lease_timer.cancel()
         self.closed = True
         self.end_life(CLOSED)
 
@@ -369,7 +379,13 @@ class ProviderLink(TurnActor):
         rows = None if self._fetching else self._registrar.held_at(self.provider)  # fetch() needs all queries listed
         known = None if rows is None else digests.known(rows, self._known)
         self._known = None
+        lease = link.welcome.epoch >> LEASE_BITS
+        if self._lease not in (0, lease) and lease:
+            self._end_lease()
+        self._lease = lease
+        self._run = link.welcome.epoch
         self.link = link
+        self._watch_lease()
         self.connections = ThreadConnections(self._dial_for_thread)
         self.is_uncalled = transport is self._node.transport
         self._asked = False
@@ -409,6 +425,46 @@ class ProviderLink(TurnActor):
 
     def _attach(self, _link: Link) -> ProviderLink:
         return self
+
+    # -- the lease, if the provider is of another host -------------------------------------------------------------
+    #
+    # The gateway closes the link when the lease is over. But it may be frozen, or killed, just then. So each process
+    # looks for itself whether the lease was renewed.
+
+    def _watch_lease(self) -> None:
+        hosts, info = self._node.info.hosts, self._node.info
+        lease = None if hosts is None else hosts.lease(info.state_dir, self.provider)
+        if self._lease_timer is not None:
+            self._lease_timer.cancel()
+            self._lease_timer = None
+        if lease is None or self._registrar.closed:
+            return
+        self._lease = self._lease or lease[0]
+        wait_s = max(0.0, min(lease[1], _LOOK_AT_LEASE_S)) if lease[0] == self._lease else 0.0
+        self._lease_timer = self._node.dispatcher.loop.call_later(wait_s, self._look_at_lease)
+
+    def _look_at_lease(self) -> None:
+        """End the lease if it is over, or if another has begun."""
+        hosts = self._node.info.hosts
+        if hosts is None or not self._lease or self._registrar.closed:
+            return
+        lease = hosts.lease(self._node.info.state_dir, self.provider)
+        if lease is None or (lease[0] == self._lease and lease[1] > 0):
+            self._watch_lease()
+            return
+        if self.link is not None:
+            self._drop_link()
+            self._registrar.post(c.LinkLost(self.provider))
+        self._end_lease()
+        if self._registrar.catalog.needs(self.provider):
+            self._want()
+
+    def _end_lease(self) -> None:
+        """Have the registrar lose all that it holds there."""
+        host = self.provider.partition("/")[0]
+        why = f"the lease at host {host!r} is over: it was not reachable for so long, and may have released this"
+        self._lease = 0
+        self._registrar.post(c.LeaseOver(self.provider, self._run, why, new_id()))
 
     # -- messages of the provider --------------------------------------------------------------------------------
 
@@ -489,6 +545,7 @@ class ProviderLink(TurnActor):
         if closed:
             return
         self._registrar.post(c.LinkLost(self.provider))
+        self._look_at_lease()
         if self._registrar.catalog.needs(self.provider) or self._fetching:
             asked = self._asked
             self._want()

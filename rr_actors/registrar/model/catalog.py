@@ -163,7 +163,8 @@ class Catalog:
       `idle`: resources that idle since the timer was set that pauses or unloads them. `rising`: resources to be resumed
       when their parts are: the parts that have not said so, or None before they were asked.
       `unsent`: queries whose priority has changed while the provider's link was not reconciled.
-      `listed`: by provider, the epoch of its run that made the last list.
+      `listed`: by provider, the epoch of its run that made the last list. `lapsed`: by provider of another host, the
+      epoch that it had in the last lease that is over.
     - `deserted`: resources that were loading when their last query ended, until the engine has looked at them.
     - `stirred`: requests for which resources are queued, until decide() has looked at the line (core/loads/lines.py).
       `said`: by queued resource, the place in line that its load was told. `timed`: queries with a timer for their
@@ -237,6 +238,7 @@ class Catalog:
         self.touched: dict[str, int | None] = {}
         self.unsent: dict[str, bool] = {}
         self.listed: dict[str, int] = {}
+        self.lapsed: dict[str, int] = {}
         self.idle: dict[str, bool] = {}
         self.rising: dict[str, tuple[str, ...] | None] = {}
         self.shut: dict[bool, Failure] = {}

@@ -358,6 +358,18 @@ class LinkLost(Command, frozen=True):
     registrar: str
 
 
+class LeaseOver(Command, frozen=True):
+    """The lease of this host at a provider's host is over: that may have released what is held there.
+
+    `run`: the epoch of the provider in the links of that lease; 0: there was none.
+    """
+
+    registrar: str
+    run: int
+    why: str
+    event: str
+
+
 class PeerGone(Command, frozen=True):
     """A provider cannot be reached. `final`: it is gone for good, and with it every query that we held there.
 

@@ -221,6 +221,22 @@ class WaitedFor(msgspec.Struct, frozen=True, array_like=True, tag=18):
     ring: list[str]
 
 
+class Leased(msgspec.Struct, frozen=True, array_like=True, tag=19):
+    """The other hosts that have a lease: release what registrars of all other hosts hold here. From the gateway alone.
+
+    The answer is Released with the same number, when that is on disk.
+    """
+
+    hosts: list[str]
+    number: Int64
+
+
+class Released(msgspec.Struct, frozen=True, array_like=True, tag=20):
+    """What registrars of hosts without a lease held is released, on disk."""
+
+    number: Int64
+
+
 def retired(name: str) -> str:
     """Return the origin of a link on which the registrar `name` is said to be gone; no registrar's name has a colon."""
     return f"{name}:retired"
@@ -245,4 +261,6 @@ Message = (
     | Reprioritise
     | Reprioritised
     | WaitedFor
+    | Leased
+    | Released
 )

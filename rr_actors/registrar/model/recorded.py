@@ -121,5 +121,7 @@ def message_entry(at: float, event: str, process: str, pid: int, registrar: str,
             return Entry(*where, message.query_id, detail=shown_priority(message.priority))
         case m.Gone():
             return Entry(*where, detail=message.origin)
+        case m.Leased():
+            return Entry(*where, detail=shortened(" ".join(message.hosts)))
         case _:
             return Entry(*where)

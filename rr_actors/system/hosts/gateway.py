@@ -12,7 +12,8 @@ import functools
 import importlib
 import importlib.machinery
 import time
-from typing import Any, cast
+from pathlib import Path
+from typing import Any, NoReturn, cast
 
 from msgspec.structs import replace
 
@@ -22,23 +23,30 @@ from rr_actors.base.errors import NameTaken, NotExported, ProtocolMismatch, RrEr
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.engine.node import Node
-from rr_actors.registrar.links.provider_link import THREADS
+from rr_actors.registrar.links.provider_link import LEASE_BITS, THREADS
 from rr_actors.registrar.model.messages import Describe, Described, Message
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor
 from rr_actors.system.hosts.exported_registrars import ExportedRegistrars
 from rr_actors.system.hosts.host_messages import (
     TO_CONSUMER,
     TO_PROVIDER,
+    Beat,
+    Beaten,
     Crossing,
     Exported,
     Exports,
+    GatewayMessage,
     check_crosses,
+    check_exports,
     no_types,
 )
 from rr_actors.system.hosts.host_settings import Hosts, named_in, names_of
 from rr_actors.system.hosts.link_relay import Relay
+from rr_actors.system.registrar_lookup import catalogs_on_disk, give_up_clients
 from rr_actors.wire.hosts.host_link import HostLink
 from rr_actors.wire.hosts.host_names import REFUSED, UNREACHABLE, UP, HostRow, away, not_exported, put_row, row_of
+from rr_actors.wire.hosts.lease_rows import LeaseRow, boot_id, now_s, read_lease, write_lease
+from rr_actors.wire.hosts.leases import BEATS, GivenLease, TakenLease, kept_s
 from rr_actors.wire.name_service import OtherHosts, Presence, registrar_key
 from rr_actors.wire.transport import Attach, Hello, Link, Receiver, Welcome
 from rr_actors.wire.unix_transport import UnixTransport
@@ -48,6 +56,7 @@ _log = Log(__name__)
 _HOSTS = "hosts"
 """The kind of the link between two gateways."""
 _AGAIN_S = 0.2
+_TICK_S = 0.05
 _LOOK_S = 1.0
 _WHY_CHARACTERS = 250
 _TWIN_S = 2.0
@@ -64,6 +73,12 @@ class _Peer:
         self.places: list[str] = []  # of the systems of that name that are there, the one that is meant first
         self.exports: dict[str, Exported] = {}
         self.meeting: asyncio.Task[None] | None = None
+        self.said: Exports | None = None  # what it has said on the present link
+        self.link: Link | None = None  # the link to its gateway
+        self.lease = TakenLease()
+        self.releasing: list[str] = []  # what releases there at the end of the lease
+        self.number = 0  # of the lease, if it releases something at its end
+        self.next_beat = 0.0
         self.because = row.why  # why it is away, without what has been tried since
 
 
@@ -124,7 +139,7 @@ class _Run:
         self._network = zenoh_link.ZenohTransport(
             hosts.group,
             hosts.name,
-            {**_MESSAGES, _HOSTS: Exports},
+            {**_MESSAGES, _HOSTS: GatewayMessage},
             listen=hosts.listen,
             connect=hosts.connect,
             frame_limit_bytes=node.config.frame_limit_bytes,
@@ -132,10 +147,15 @@ class _Run:
         )
         self._peers: dict[str, _Peer] = {}
         self._told: dict[Link, str] = {}  # the links by which other hosts hear what is exported
-        self._relays: dict[Relay, str] = {}  # and the other host of each
+        self._relays: dict[Relay, tuple[str, bool]] = {}  # the other host of each, and whether it serves that host
+        self._given: dict[str, GivenLease] = {}
+        self._known_from = now_s() + kept_s(hosts.lease_s)  # then all that were away for that long are without a lease
+        self._told_known = False
+        self._ticking: asyncio.Task[None] | None = None
         self._exported: ExportedRegistrars | None = None
         self._twins: asyncio.TimerHandle | None = None
         self._looking: asyncio.Task[None] | None = None
+        self._giving_up: asyncio.Task[None] | None = None
         self._closing = False
 
     async def start(self) -> None:
@@ -143,9 +163,11 @@ class _Run:
         self._begin_rows()
         await self._local.listen(self._accept_here)
         self._node.keeper.transports.append(self._local)
-        exports = self._hosts.exports
-        self._exported = ExportedRegistrars(self._name, exports, self._node, self._local, self._tell_exports)
+        self._exported = ExportedRegistrars(
+            self._name, self._hosts.exports, self._node, self._local, self._tell_exports, self._leased
+        )
         await self._network.listen(self._accept_host)
+        self._ticking = asyncio.get_running_loop().create_task(self._tick())
         self._looking = asyncio.get_running_loop().create_task(self._look())
 
     async def close(self) -> None:
@@ -154,8 +176,9 @@ class _Run:
         steps = Steps()
         if self._twins is not None:
             self._twins.cancel()
-        if self._looking is not None:
-            self._looking.cancel()
+        for task in (self._looking, self._ticking, self._giving_up):
+            if task is not None:
+                task.cancel()
         if self._exported is not None:
             steps.take("ending to look after exports", self._exported.close)
         for peer in self._peers.values():
@@ -180,6 +203,7 @@ class _Run:
             why = "not seen since this system started" if before is None else "the gateway here has started again"
             since = before.since if before is not None and before.state == UNREACHABLE else time.time()
             peer = self._peers[name] = _Peer(name, HostRow(UNREACHABLE, since, why))
+            self._begin_lease(peer)
             for registrar in self._directory.other_hosts_registrars():
                 if registrar.startswith(f"{name}/"):
                     self._directory.mark(registrar_key(registrar), Presence.STARTING, away(name, peer.row))
@@ -199,6 +223,7 @@ class _Run:
         peer = self._peers.get(name)
         if peer is None:
             peer = self._peers[name] = _Peer(name, HostRow(UNREACHABLE, time.time(), "not met yet"))
+            self._begin_lease(peer)
             put_row(self._directory, name, peer.row)
         peer.places = places
         if not places:
@@ -227,10 +252,11 @@ class _Run:
         """Keep a link to a host that is alive, by which it says what it exports."""
         since = asyncio.get_running_loop().time()
         while peer.places and not self._closing:
-            lost = asyncio.Event()
-            hearing = _Hearing(functools.partial(self._heard, peer), lost)
+            hearing = _Hearing(functools.partial(self._said, peer))
             try:
-                await self._network.connect(peer.name, Hello(_HOSTS, peer.name, self._name, 0), hearing.attach)
+                hello = Hello(_HOSTS, peer.name, self._name, 0)
+                peer.link = await self._network.connect(peer.name, hello, hearing.attach)
+                peer.next_beat = 0.0
             except ProtocolMismatch as error:
                 self._refused(peer, str(error))
                 return
@@ -240,13 +266,35 @@ class _Run:
                 await asyncio.sleep(_AGAIN_S)
                 continue
             except RrError as error:
-                _log.info("%s: no link to host %s yet: %s", self._name, peer.name, error)
+                self._away(peer, f"no link to it: {error}")
                 await asyncio.sleep(_AGAIN_S)
                 continue
-            await lost.wait()
-            self._away(peer, "the link to it is lost")
+            await hearing.lost_event.wait()
+            peer.link = None
+            self._away(peer, f"the link to it is lost{hearing.because}")
+            await asyncio.sleep(_AGAIN_S)
 
-    def _heard(self, peer: _Peer, message: Exports) -> None:
+    def _said(self, peer: _Peer, message: GatewayMessage) -> None:
+        """Take what the gateway of another host says on the link to it. It is up when it has heard a heartbeat."""
+        match message:
+            case Exports():
+                check_exports(message)
+                peer.said = message
+                if peer.row.state == UP:
+                    self._take_exports(peer, message)
+            case Beaten(number):
+                if peer.said is None or not peer.lease.acknowledged(number, peer.said.lease_s):
+                    raise Unavailable(f"it has heard heartbeat {number}: none of that number waits")
+                if peer.lease.is_over(now_s()):
+                    self._end_taken(peer)
+                    return
+                self._write_lease(peer)
+                if peer.row.state != UP:
+                    self._take_exports(peer, peer.said)
+            case Beat():
+                _refuse(message)
+
+    def _take_exports(self, peer: _Peer, message: Exports) -> None:
         """Write what a host exports into the directory; then that it is up."""
         peer.exports = {one.name: one for one in message.exported}
         for name, one in peer.exports.items():
@@ -255,7 +303,20 @@ class _Run:
         for registrar in self._directory.other_hosts_registrars():
             if registrar.startswith(prefix) and registrar.removeprefix(prefix) not in peer.exports:
                 self._directory.mark(registrar_key(registrar), Presence.GONE, not_exported(peer.name))
+        if peer.row.state != UP and self._giving_up is None:
+            self._giving_up = asyncio.get_running_loop().create_task(self._give_up_clients())
         self._set_row(peer, UP, _second(peer))
+
+    async def _give_up_clients(self) -> None:
+        """Release what clients of a killed application have left at other hosts: no gateway ran when this one began."""
+        try:
+            catalogs = await self._node.dispatcher.workers.run(
+                catalogs_on_disk, self._node.config, Path(self._node.info.state_dir)
+            )
+            ended = (Presence.DORMANT, Presence.GONE)
+            await give_up_clients(self._node, [name for name in catalogs if self._node.status_of(name) in ended])
+        finally:
+            self._giving_up = None
 
     def _write(self, peer: _Peer, name: str, one: Exported) -> None:
         key = registrar_key(f"{peer.name}/{name}")
@@ -266,14 +327,21 @@ class _Run:
 
     def _away(self, peer: _Peer, why: str) -> None:
         """Write that a host is not reachable; loads there wait, within their time limits."""
-        if peer.row.state == UNREACHABLE:
-            return
         peer.because = why
+        peer.said = None
+        peer.lease.lose()
+        if peer.row.state == UNREACHABLE:
+            self._say_why(peer, why)
+            return
         self._set_row(peer, UNREACHABLE, why)
         for name in peer.exports:
             self._directory.mark(registrar_key(f"{peer.name}/{name}"), Presence.STARTING, away(peer.name, peer.row))
         peer.exports = {}
-        for relay in [relay for relay, host in self._relays.items() if host == peer.name]:
+        self._close_relays(peer.name, serving=False)
+        self._close_relays(peer.name, serving=True)
+
+    def _close_relays(self, host: str, *, serving: bool) -> None:
+        for relay in [relay for relay, place in self._relays.items() if place == (host, serving)]:
             relay.close()
 
     def _refused(self, peer: _Peer, why: str, *, name_taken: bool = False) -> None:
@@ -283,6 +351,79 @@ class _Run:
             if registrar.startswith(f"{peer.name}/"):
                 self._directory.mark(registrar_key(registrar), Presence.STARTING, away(peer.name, peer.row))
 
+    # -- leases ----------------------------------------------------------------------------------------------------
+
+    async def _tick(self) -> None:
+        """Send heartbeats, and end the leases that are over."""
+        while True:
+            now = now_s()
+            for peer in [*self._peers.values()]:
+                if peer.lease.is_over(now):
+                    self._end_taken(peer)
+                elif peer.link is not None and peer.said is not None and now >= peer.next_beat:
+                    peer.next_beat = now + peer.said.lease_s / BEATS
+                    with contextlib.suppress(RrError):  # it does not read: the lease ends
+                        peer.link.send_now(Beat(peer.lease.beat(now)))
+            for host, given in [*self._given.items()]:
+                if given.is_over(now):
+                    self._end_given(host)
+            if not self._told_known and now >= self._known_from and self._exported is not None:
+                self._told_known = True
+                self._exported.tell_leased()
+            await asyncio.sleep(_TICK_S)
+
+    def _begin_lease(self, peer: _Peer) -> None:
+        """Go on with the lease of a gateway that was killed, or of a system that has ended."""
+        row = read_lease(self._node.info.state_dir, peer.name)
+        if row is not None:
+            peer.number = row.number
+            peer.releasing = row.registrars
+            peer.lease = TakenLease(now_s() + row.left_s)
+
+    def _write_lease(self, peer: _Peer) -> None:
+        """Write the lease for the processes of this system, if anything is released at its end."""
+        assert peer.said is not None
+        releasing = [one.name for one in peer.said.exported if one.releases]
+        if releasing or peer.number:
+            peer.number = peer.number or 1
+            peer.releasing = releasing
+            self._write_row(peer, peer.lease.until or 0.0)
+
+    def _write_row(self, peer: _Peer, until: float) -> None:
+        row = LeaseRow(peer.number, until, boot_id(), peer.releasing)
+        try:
+            write_lease(self._node.info.state_dir, peer.name, row)
+        except OSError as error:
+            _log.error("the lease at host %s is not written, so what is held there is lost: %s", peer.name, error)
+
+    def _end_taken(self, peer: _Peer) -> None:
+        """End the lease of this host at another: it may release what is held there. The next one has another number."""
+        peer.lease = TakenLease()
+        if peer.number:
+            _log.error("%s: the lease at host %s is over: what is held there is lost", self._name, peer.name)
+            peer.number += 1
+            self._write_row(peer, 0.0)
+        if peer.link is not None:
+            peer.link.close()
+        if peer.row.state == UP:
+            self._away(peer, "it has not answered for the time of the lease")
+        elif peer.number:
+            self._away(peer, f"{peer.because}; the lease is over, and what was held there is lost")
+
+    def _end_given(self, host: str) -> None:
+        """End the lease of another host here: nothing that is still on its way from there does anything."""
+        del self._given[host]
+        _log.warning("%s: the lease of host %s is over: what it holds is released", self._name, host)
+        self._close_relays(host, serving=True)
+        for link in [link for link, name in self._told.items() if name == host]:
+            link.close()
+        if self._exported is not None:
+            self._exported.lease_over(host)
+
+    def _leased(self) -> set[str] | None:
+        """Return the hosts that have a lease here; None: others may have one of the gateway that was before this."""
+        return set(self._given) if now_s() >= self._known_from else None
+
     async def _look(self) -> None:
         """Write of each host that is away where it has been looked for, while that goes on."""
         while True:
@@ -290,7 +431,7 @@ class _Run:
                 tried = self._tried(await self._network.reached())
                 for peer in self._peers.values():
                     if _is_away(peer):
-                        self._say_tried(peer, tried)
+                        self._say_why(peer, f"{peer.because}; {tried}")
             await asyncio.sleep(_LOOK_S)
 
     def _tried(self, reached: list[str]) -> str:
@@ -302,9 +443,10 @@ class _Run:
         ]
         return ", ".join(f"{what} {few(places)}" for what, places in said if places)
 
-    def _say_tried(self, peer: _Peer, tried: str) -> None:
+    def _say_why(self, peer: _Peer, why: str) -> None:
+        """Write another reason for a host's being away, also into the entries of its registrars."""
         before = away(peer.name, peer.row)
-        self._set_row(peer, UNREACHABLE, f"{peer.because}; {tried}")
+        self._set_row(peer, UNREACHABLE, why)
         if before == (now := away(peer.name, peer.row)):
             return
         for registrar in self._directory.other_hosts_registrars():
@@ -330,6 +472,8 @@ class _Run:
         provider = None if peer is None else peer.exports.get(registrar)
         if provider is None or provider.status != Presence.UP:
             raise Unavailable(f"registrar {hello.to}: not reachable now")
+        if peer is None or peer.lease.is_over(now_s()):
+            raise Unavailable(f"registrar {hello.to}: the lease is over")
         crossing = Crossing(self._name, host)
         there = replace(hello, to=registrar, origin=f"{self._name}/{hello.origin}")
 
@@ -344,9 +488,12 @@ class _Run:
             return crossing.to_consumer(message)
 
         def attach(link: Link) -> Receiver:
-            return self._relay(link, host, functools.partial(self._network.connect, host, there), forth, back)
+            dial = functools.partial(self._network.connect, host, there)
+            return self._relay(link, (host, False), provider.epoch, dial, forth, back)
 
-        return Welcome(provider.epoch), attach
+        # Another lease is another incarnation of the provider: answers of the one before do not count.
+        number = peer.number if provider.releases else 0
+        return Welcome(provider.epoch | number << LEASE_BITS), attach
 
     # -- links of other hosts --------------------------------------------------------------------------------------
 
@@ -361,9 +508,22 @@ class _Run:
 
     def _attach_gateway(self, link: Link) -> Receiver:
         host = self._told[link] = _sender(link)
+        given = self._given.setdefault(host, GivenLease(now_s(), self._hosts.lease_s))
+        given.hear(now_s())
         if self._exported is not None:
-            link.send_now(self._exported.for_host(host))
-        return _Hearing(_refuse, asyncio.Event(), functools.partial(self._told.pop, link, None))
+            link.send_now(self._exports_for(host))
+
+        def heard(message: GatewayMessage) -> None:
+            if type(message) is not Beat or self._given.get(host) is not given:
+                _refuse(message)
+            given.hear(now_s())
+            link.send_now(Beaten(message.number))
+
+        return _Hearing(heard, functools.partial(self._told.pop, link, None))
+
+    def _exports_for(self, host: str) -> Exports:
+        assert self._exported is not None
+        return Exports(self._exported.for_host(host), float(self._hosts.lease_s))
 
     def _attach_host(self, host: str, link: Link) -> Receiver:
         """Serve a consumer of another host, as which no third one may speak."""
@@ -371,6 +531,8 @@ class _Run:
         if host != _sender(link) or hello.origin.count("/") != 1:
             text = f"host {_sender(link)!r} speaks for {hello.origin!r}: expected a registrar of its own"
             raise NotExported(text, host=self._name, registrar=hello.to)
+        if host not in self._given:
+            raise Unavailable(f"host {host!r} has no lease at {self._name!r}: its gateway comes first")
         peer = link.peer
 
         def forth(_link: Link, message: Any) -> Any:
@@ -387,11 +549,11 @@ class _Run:
             assert self._exported is not None
             return await self._local.connect(self._exported.address(hello.to), hello, attach)
 
-        return self._relay(link, host, dial, forth, back)
+        return self._relay(link, (host, True), link.welcome.epoch, dial, forth, back)
 
-    def _relay(self, link: Link, host: str, dial: Any, forth: Any, back: Any) -> Receiver:
-        relay = Relay(link, dial, forth, back, self._ended)
-        self._relays[relay] = host
+    def _relay(self, link: Link, place: tuple[str, bool], epoch: int, dial: Any, forth: Any, back: Any) -> Receiver:
+        relay = Relay(link, epoch, dial, forth, back, self._ended)
+        self._relays[relay] = place
         return relay.end
 
     def _ended(self, relay: Relay) -> None:
@@ -402,14 +564,16 @@ class _Run:
         if self._exported is not None:
             for link, host in [*self._told.items()]:
                 with contextlib.suppress(RrError):  # it does not read: it hears of it with the next link
-                    link.send_now(self._exported.for_host(host))
+                    link.send_now(self._exports_for(host))
 
 
 class _Hearing:
     """The receiver of a link between two gateways."""
 
-    def __init__(self, heard: Any, lost: asyncio.Event, ended: Any = None) -> None:
-        self._heard, self._lost, self._ended = heard, lost, ended
+    def __init__(self, heard: Any, ended: Any = None) -> None:
+        self._heard, self._ended = heard, ended
+        self.lost_event = asyncio.Event()
+        self.because = ""
 
     def attach(self, _link: Link) -> Receiver:
         return self
@@ -418,7 +582,8 @@ class _Hearing:
         self._heard(message)
 
     def lost(self, link: Link, reason: Exception | None) -> None:
-        self._lost.set()
+        self.because = f": {reason}" if reason is not None else ""
+        self.lost_event.set()
         if self._ended is not None:
             self._ended()
 
@@ -442,5 +607,5 @@ def _sender(link: Link) -> str:
     return cast(HostLink, link).address
 
 
-def _refuse(message: Any) -> None:
+def _refuse(message: Any) -> NoReturn:
     raise Unavailable(f"{type(message).__name__} on a link that only the other side sends on")

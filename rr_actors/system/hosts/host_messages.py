@@ -14,8 +14,10 @@ import msgspec
 from msgspec.structs import replace
 
 from rr_actors.base import pickling
-from rr_actors.base.errors import Unavailable
+from rr_actors.base.errors import InvalidName, Unavailable
+from rr_actors.base.names import check_name
 from rr_actors.base.values.failure import Failure
+from rr_actors.registrar.links.provider_link import LEASE_BITS
 from rr_actors.registrar.model.messages import (
     Describe,
     Described,
@@ -37,21 +39,64 @@ from rr_actors.registrar.model.messages import (
     UnloadRefused,
     WaitedFor,
 )
+from rr_actors.system.hosts.host_settings import LEASE_LEAST_S, LEASE_MOST_S
+from rr_actors.wire.name_service import Presence
 
 
 class Exported(msgspec.Struct, frozen=True, array_like=True):
-    """A registrar that another host may load from: its status, its incarnation while it is up, and why it is not."""
+    """A registrar that another host may load from: its status, its incarnation while it is up, and why it is not.
+
+    `releases`: it releases what a host holds whose lease is over.
+    """
 
     name: str
     status: str
     epoch: int
     why: str
+    releases: bool = False
 
 
 class Exports(msgspec.Struct, frozen=True, array_like=True, tag=1):
-    """All registrars that the receiver may load from. Sent at first, and after each change."""
+    """All registrars that the receiver may load from, and its lease. Sent at first, and after each change."""
 
     exported: list[Exported]
+    lease_s: float
+
+
+class Beat(msgspec.Struct, frozen=True, array_like=True, tag=2):
+    """A heartbeat: the sender lives, and has what it holds."""
+
+    number: int
+
+
+class Beaten(msgspec.Struct, frozen=True, array_like=True, tag=3):
+    """The heartbeat with this number was heard."""
+
+    number: int
+
+
+GatewayMessage = Exports | Beat | Beaten
+"""What two gateways say to each other."""
+
+
+_EXPORTS_LIMIT = 1000
+
+
+def check_exports(message: Exports) -> None:
+    """Raise Unavailable, which breaks the link, if this is nothing that a host may say of its registrars."""
+    if not LEASE_LEAST_S <= message.lease_s <= LEASE_MOST_S:
+        text = f"its lease is {message.lease_s:g} s: expected {LEASE_LEAST_S:g} to {LEASE_MOST_S:g}"
+        raise Unavailable(text)
+    if len(message.exported) > _EXPORTS_LIMIT:
+        raise Unavailable(f"it exports {len(message.exported)} registrars: expected {_EXPORTS_LIMIT} at most")
+    for one in message.exported:
+        try:
+            check_name(one.name)
+            Presence(one.status)
+            if not 0 <= one.epoch < 1 << LEASE_BITS:
+                raise ValueError(f"its incarnation is {one.epoch}")
+        except (InvalidName, ValueError) as error:
+            raise Unavailable(f"it exports a registrar that none can be: {error}") from error
 
 
 TO_PROVIDER = frozenset({Load, Unload, Fetch, NoticesHandled, Probe, Gone, Reprioritise})

@@ -6,7 +6,7 @@ import dataclasses
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Self, TypeVar, cast
+from typing import Any, Literal, Self, TypeVar, cast
 
 from rr_actors.base.checks import examined, invalid
 from rr_actors.base.errors import InvalidName, InvalidSpec, is_a
@@ -16,23 +16,31 @@ from rr_actors.wire.hosts.host_names import ENDPOINT, HostNames, is_endpoint
 
 _T = TypeVar("_T")
 
+LEASE_LEAST_S = 1.0
+LEASE_MOST_S = 3600.0
+
 
 @dataclass(frozen=True)
 class Export:
-    """Which hosts may load from a registrar.
+    """Which hosts may load from a registrar, and what becomes of what they hold.
 
     Args:
         to: the names of these hosts. Default: None, all hosts of the group. Name them where not all of them may.
+        on_lost: what is done with what a host holds when its lease is over (Hosts.lease_s). Default: "keep", it is kept
+            until that host is back. Set "release" where others need it meanwhile: that host takes it as lost.
 
     Raises:
         InvalidSpec: `.field`, `.expected`, `.got`.
     """
 
     to: Sequence[str] | None = None
+    on_lost: Literal["keep", "release"] = "keep"
 
     def __post_init__(self) -> None:
         if self.to is not None:
             object.__setattr__(self, "to", tuple(_names(self.to, "Export", "to", "host")))
+        if self.on_lost not in ("keep", "release"):
+            raise invalid("Export", "on_lost", "'keep' or 'release'", self.on_lost)
 
 
 @dataclass(frozen=True)
@@ -47,6 +55,9 @@ class Hosts:
         exports: the registrars that other hosts may load from, by name. Default: {}, none. Name those that others need.
         routes: the registrars here for which another host's are meant, as {"maps": "hostb/maps"}: then
             load("maps/map") loads from there. Default: {}, none. Name one when a manager moves to another host.
+        lease_s: for so many seconds after it was last heard another host has what it holds here, 1 to 3600. It tries to
+            reach this one again for as long (docs/hosts.md). Default: 10. A longer one outlasts longer outages; a
+            shorter one gives sooner to others what Export(on_lost="release") says.
         group: hosts of one group see each other. Default: "rr". Set another for a second group on the same network.
 
     Raises:
@@ -58,6 +69,7 @@ class Hosts:
     connect: Sequence[str] = ()
     exports: Mapping[str, Export] = field(default_factory=dict[str, Export])
     routes: Mapping[str, str] = field(default_factory=dict[str, str])
+    lease_s: float = 10.0
     group: str = "rr"
 
     def __post_init__(self) -> None:
@@ -95,6 +107,9 @@ class Hosts:
         _name(self.name, "Hosts", "name", "the name of a host")
         who = f"Hosts {self.name!r}"
         _name(self.group, who, "group", "a name")
+        lease_s = cast(object, self.lease_s)
+        if not (is_a(lease_s, (int, float)) and not is_a(lease_s, bool) and LEASE_LEAST_S <= lease_s <= LEASE_MOST_S):
+            raise invalid(who, "lease_s", f"a number from {LEASE_LEAST_S:g} to {LEASE_MOST_S:g}", lease_s)
         for part in ("listen", "connect"):
             given = _strings(getattr(self, part), who, part, "a list of endpoints")
             for endpoint in given:

@@ -14,6 +14,7 @@ _log = Log(__name__)
 
 WAITING_LIMIT = 10_000
 """How many messages may wait until the other link is open."""
+_AGAIN_S = 0.2
 
 
 class _End:
@@ -34,6 +35,7 @@ class Relay:
 
     Args:
         near: the link that was accepted.
+        epoch: the incarnation of the provider for which it was accepted.
         dial: opens the other link.
         forth: takes a message of the near link. Returns what goes out by the other; None: nothing does.
         back: the same for a message of the other link.
@@ -43,12 +45,14 @@ class Relay:
     def __init__(
         self,
         near: Link,
+        epoch: int,
         dial: Callable[[Attach], Awaitable[Link]],
         forth: Callable[[Link, Any], Any],
         back: Callable[[Link, Any], Any],
         ended: Callable[[Relay], None],
     ) -> None:
-        self._near, self._dial, self._forth, self._back, self._ended = near, dial, forth, back, ended
+        self._near, self._epoch, self._dial, self._ended = near, epoch, dial, ended
+        self._forth, self._back = forth, back
         self._far: Link | None = None
         self._waiting: list[Any] = []
         self._closed = False
@@ -67,14 +71,18 @@ class Relay:
                 far.close()
                 return
             self._far = far
-            if far.welcome.epoch != self._near.welcome.epoch:
+            if far.welcome.epoch != self._epoch:
                 raise Unavailable(f"{hello.to} has started again meanwhile")
             waiting, self._waiting = self._waiting, []
             for message in waiting:
                 far.send(message)
             far.flush()
-        except RrError as error:
-            _log.info("no link of %s to %s: %s", hello.origin, hello.to, error)
+        except Exception as error:
+            if isinstance(error, RrError):
+                _log.info("no link of %s to %s: %s", hello.origin, hello.to, error)
+            else:
+                _log.exception("no link of %s to %s", hello.origin, hello.to)
+            await asyncio.sleep(_AGAIN_S)  # the other end of `near` opens another at once
             self.close()
 
     def _from_near(self, link: Link, message: Any) -> None:
@@ -111,9 +119,9 @@ class Relay:
         if self._closed:
             return
         self._closed = True
-        if self._far is None:
+        if self._opening is not asyncio.current_task():
             self._opening.cancel()
-        else:
+        if self._far is not None:
             self._far.close()
         self._near.close()
         self._ended(self)

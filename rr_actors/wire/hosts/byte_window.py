@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 
 from rr_actors.base.errors import Unavailable
+from rr_actors.wire.frames import GOODBYE
 
 DATA = 0
 """The kind of a packet with a part of the stream; its number is how many bytes were sent before it."""
@@ -40,6 +41,11 @@ def read_packet(data: bytes) -> tuple[int, int, bytes]:
     if len(data) > _HEAD.size + PACKET_BYTES:
         raise Unavailable(f"a packet of {len(data)} bytes: expected {_HEAD.size + PACKET_BYTES} at most")
     return kind, number, data[_HEAD.size :]
+
+
+def is_stray(data: bytes) -> bool:
+    """Return whether a packet that came for no open link shows that the other side believes in that link."""
+    return len(data) > _HEAD.size and data[0] == DATA and data[_HEAD.size :] != GOODBYE
 
 
 class SendWindow:

@@ -147,7 +147,11 @@ class HostLink:
             try:
                 self._receiver.received(self, message)
             except Exception as error:
-                _log.exception("closing the link with %s: its receiver failed on %s", self.peer, type(message).__name__)
+                said = type(message).__name__
+                if isinstance(error, Unavailable):
+                    _log.warning("closing the link with %s: %s: %s", self.peer, said, error)
+                else:
+                    _log.exception("closing the link with %s: its receiver failed on %s", self.peer, said)
                 self.break_off(error)
                 return
         if self._reader.error is not None:

@@ -13,6 +13,7 @@ import msgspec
 
 from rr_actors.base.errors import NameTaken, NotExported, ProtocolMismatch, UnknownHost, did_you_mean, few
 from rr_actors.base.names import ServerId
+from rr_actors.wire.hosts.lease_rows import read_lease
 from rr_actors.wire.name_service import Directory, HostInfo, Presence, registrar_key
 
 UP = "up"
@@ -132,6 +133,15 @@ class HostNames(msgspec.Struct, frozen=True):
                     exports[name.removeprefix(f"{host}/")] = str(entry.status)
             found.append(HostInfo(host, row.state, row.since, row.why, exports))
         return found
+
+    def lease(self, state_dir: str, registrar: str) -> tuple[int, float] | None:
+        """Return the number of the lease at the host of a registrar, and how many seconds it goes on.
+
+        None: that registrar is of this host, or it releases nothing when a lease ends.
+        """
+        host, slash, name = registrar.partition("/")
+        row = read_lease(state_dir, host) if slash else None
+        return None if row is None or name not in row.registrars else (row.number, row.left_s)
 
     def unreachable(self, directory: Directory, registrar: str) -> HostInfo | None:
         """Return the host of a registrar if that is another one, and not reachable now."""

@@ -8,7 +8,9 @@ keys. The keys, all below `rr/GROUP/ADDRESS` of the side that sends:
     rr/GROUP/ADDRESS/to/OTHER/LINK      the packets of a link, from ADDRESS to OTHER
     rr/GROUP/ADDRESS/alive/WHERE        a liveliness token; when it is gone, all links to ADDRESS are lost
 
-Zenoh's calls may block. So one thread makes them all, in order; the event loop only puts them into a queue.
+Zenoh's calls may block: one to a host that reads nothing does, for seconds. So each host that is there has a thread
+that makes the calls to it, in order, and one more thread makes all other calls. The event loop only puts them into
+queues.
 """
 
 # Zenoh's stubs leave out what some calls return.
@@ -26,7 +28,7 @@ import socket
 import threading
 import uuid
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import zenoh
@@ -35,7 +37,7 @@ from rr_actors.base.errors import ConfigError, NameTaken, ProtocolMismatch, RrEr
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.failure import Failure, error_of, failure_of
 from rr_actors.wire.frames import FRAME_LIMIT_BYTES, GOODBYE, decoder_of
-from rr_actors.wire.hosts.byte_window import DATA, packet
+from rr_actors.wire.hosts.byte_window import BROKEN, DATA, is_stray, packet
 from rr_actors.wire.hosts.host_link import HostLink
 from rr_actors.wire.hosts.host_names import ENDPOINT, is_endpoint
 from rr_actors.wire.transport import Accept, Attach, Hello, Link, Welcome
@@ -43,7 +45,7 @@ from rr_actors.wire.unix_link import CLOSE_LIMIT_S, Wire
 
 _log = Log(__name__)
 
-PROTOCOL = 1
+PROTOCOL = 2
 """The version of what hosts say to each other."""
 OPENING_LIMIT_S = 5.0
 """How long the other side may take to answer an opening."""
@@ -53,7 +55,7 @@ _FIND_AGAIN_S = 0.05
 _OPENING_BYTES = 64 * 1024
 _TO_ACCEPTOR = ".a"
 _TO_DIALLER = ".d"
-_NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
+_NAME = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,63}")
 
 
 class _Opening(msgspec.Struct, frozen=True, array_like=True):
@@ -73,9 +75,19 @@ class _Opened(msgspec.Struct, frozen=True, array_like=True):
     refusal: Failure | None
 
 
+_Calls = queue.SimpleQueue[Callable[[zenoh.Session], object] | None]
+
 _encode = msgspec.msgpack.encode
 _read_opening = msgspec.msgpack.Decoder(_Opening).decode
 _read_opened = msgspec.msgpack.Decoder(_Opened).decode
+
+
+class _Sender(NamedTuple):
+    """The thread that makes the calls to one address."""
+
+    calls: _Calls
+    thread: threading.Thread
+    ended: asyncio.Event
 
 
 def _here() -> str:
@@ -131,7 +143,9 @@ class ZenohTransport:
         self._wires = {kind: Wire(decoder_of(message_type), frame_limit_bytes) for kind, message_type in codecs.items()}
         self._listen = [*listen]
         self._connect = [*connect]
-        self._calls: queue.SimpleQueue[Callable[[zenoh.Session], object] | None] = queue.SimpleQueue()
+        self._calls = _Calls()
+        self._senders: dict[str, _Sender] = {}  # of each other address that is there
+        self._session: zenoh.Session | None = None
         self._links: dict[tuple[str, str], HostLink] = {}
         self._early: dict[tuple[str, str], list[bytes]] = {}  # packets of links that connect() waits for
         self._on_peer = on_peer
@@ -215,7 +229,14 @@ class ZenohTransport:
 
         handler: Any = zenoh.handlers.Callback(take, end, indirect=False)
         key = f"rr/{self._group}/{address}/open/{where}"
-        self._calls.put(lambda session: session.get(key, handler, payload=opening, timeout=OPENING_LIMIT_S))
+
+        def get(session: zenoh.Session) -> None:
+            try:
+                session.get(key, handler, payload=opening, timeout=OPENING_LIMIT_S)
+            except zenoh.ZError:  # the session is being closed
+                end()
+
+        self._calls_to(address).put(get)
         return await done
 
     async def reached(self) -> list[str]:
@@ -268,6 +289,7 @@ class ZenohTransport:
             self._call_soon(self._set_ready, failed)
             self._call_soon(self._ended.set)
             return
+        self._session = session
         own = f"rr/{self._group}/{self.address}"
         packets: Any = zenoh.handlers.Callback(self._on_packet, indirect=False)
         openings: Any = zenoh.handlers.Callback(self._on_opening, indirect=False)
@@ -277,14 +299,35 @@ class ZenohTransport:
         session.liveliness().declare_subscriber(f"rr/{self._group}/*/alive/*", alive, history=True)
         token = session.liveliness().declare_token(f"{own}/alive/{self._where}")
         self._call_soon(self._set_ready, None)
-        while (call := self._calls.get()) is not None:
-            try:
-                call(session)
-            except Exception as error:
-                _log.warning("%s: a call of zenoh failed: %s", self.address, error)
+        self._make(self._calls)
         token.undeclare()
         session.close()
         self._call_soon(self._ended.set)
+
+    def _make(self, calls: _Calls) -> None:
+        """Make the calls of a queue, one after another, until there is a None."""
+        assert self._session is not None
+        while (call := calls.get()) is not None:
+            try:
+                call(self._session)
+            except Exception as error:
+                _log.warning("%s: a call of zenoh failed: %s", self.address, error)
+
+    def _begin_sender(self, address: str) -> _Sender:
+        calls, ended = _Calls(), asyncio.Event()
+
+        def run() -> None:
+            self._make(calls)
+            self._call_soon(ended.set)
+
+        thread = threading.Thread(target=run, name=f"zenoh of {self.address} to {address}", daemon=True)
+        thread.start()
+        return _Sender(calls, thread, ended)
+
+    def _calls_to(self, address: str) -> _Calls:
+        """Return the queue of calls to an address."""
+        sender = self._senders.get(address)
+        return self._calls if sender is None else sender.calls
 
     def _set_ready(self, error: Exception | None) -> None:
         if self._ready is not None and not self._ready.done():
@@ -301,7 +344,7 @@ class ZenohTransport:
         to = f"rr/{self._group}/{self.address}/to/{address}/{link}"
 
         def put(data: bytes) -> None:
-            self._calls.put(
+            self._calls_to(address).put(
                 lambda session: session.put(to, data, congestion_control=zenoh.CongestionControl.BLOCK, express=False)
             )
 
@@ -315,6 +358,8 @@ class ZenohTransport:
 
     def _on_alive(self, sample: zenoh.Sample) -> None:
         parts = str(sample.key_expr).split("/")
+        if not _NAME.fullmatch(parts[2]):
+            return  # a stranger's: no host has such a name
         change = self._lose if sample.kind == zenoh.SampleKind.DELETE else self._find
         if (parts[2], parts[4]) != (self.address, self._where):
             self._call_soon(change, parts[2], parts[4])
@@ -329,8 +374,19 @@ class ZenohTransport:
             link.take(data)
         elif (early := self._early.get(key)) is not None:
             early.append(data)
+        elif is_stray(data):
+            self._answer_stray(*key)
+
+    def _answer_stray(self, address: str, link: str) -> None:
+        """Tell the other side that its link has ended here: it may have lost no packet, and so would never know."""
+        name, end = link[:-2], link[-2:]
+        if end in (_TO_ACCEPTOR, _TO_DIALLER) and _NAME.fullmatch(address) and _NAME.fullmatch(name):
+            back = _TO_DIALLER if end == _TO_ACCEPTOR else _TO_ACCEPTOR
+            self._putter(address, name + back)(packet(BROKEN, 0, b"it has ended at this side"))
 
     def _find(self, address: str, where: str) -> None:
+        if address != self.address and address not in self._senders:
+            self._senders[address] = self._begin_sender(address)
         places = self._places.setdefault(address, [])
         if where not in places:
             places.append(where)
@@ -342,6 +398,8 @@ class ZenohTransport:
             return
         is_meant = places[0] == where and address != self.address
         places.remove(where)
+        if not places and address in self._senders:
+            self._senders.pop(address).calls.put(None)
         for key, link in [*self._links.items()] if is_meant else []:
             if key[0] == address:
                 link.end(Unavailable(f"{link.peer} is not reachable any more"))
@@ -352,10 +410,11 @@ class ZenohTransport:
             self._on_peer(address, [place_of(where) for where in self._places[address]])
 
     def _answer(self, query: zenoh.Query, data: bytes) -> None:
-        link = None
+        link, origin = None, ""
         peer = "a host that cannot be read"
         try:
             opening = self._opening_of(data)
+            origin = opening.origin
             peer = f"{opening.hello.origin} (at {opening.origin})"
             link = self._open_link(opening)
             opened = _Opened(link.welcome, None)
@@ -369,7 +428,7 @@ class ZenohTransport:
             with query:
                 query.reply(query.key_expr, answer)
 
-        self._calls.put(reply)
+        self._calls_to(origin).put(reply)
         if link is not None:
             link.start()
 
@@ -422,6 +481,16 @@ class ZenohTransport:
         for link in [*self._links.values()]:
             link.end(None)
         if self._thread is not None:
+            senders = [*self._senders.values()]
+            for sender in senders:
+                sender.calls.put(None)
+            with contextlib.suppress(TimeoutError):  # the end of the session ends a call to a host that reads nothing
+                async with asyncio.timeout(CLOSE_LIMIT_S):
+                    for sender in senders:
+                        await sender.ended.wait()
             self._calls.put(None)
             await self._ended.wait()
             self._thread.join()
+            for sender in senders:
+                await sender.ended.wait()
+                sender.thread.join()
