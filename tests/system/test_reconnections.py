@@ -258,10 +258,8 @@ def test_a_system_that_was_killed_is_waited_for_too(run: Callable[[], int], stat
         assert lamp.fetch_state() == "OK"
 
 
-def test_what_a_killed_system_held_for_a_connected_program_is_not_held_twice(
-    run: Callable[..., int], state_dir: Path
-) -> None:
-    """The client is back before the managers that have the queries of its time before."""
+def test_what_a_killed_system_held_for_a_connection_is_not_held_twice(run: Callable[..., int], state_dir: Path) -> None:
+    """The program is back before the managers that have the queries of its time before."""
     killed = run()
     with rr.connect(state_dir, reconnect=True) as client, client.open_registrar("w") as worker:
         red, blue = (worker.load("lamps/lamp", name) for name in ("red", "blue"))

@@ -272,9 +272,9 @@ def reached(monkeypatch: pytest.MonkeyPatch) -> Gate:
     gate = Gate()
 
     class Slow(ConsoleConnection):
-        def record(self) -> Iterator[Entries]:
+        def record(self, *, decisions: bool = False) -> Iterator[Entries]:
             gate()
-            return super().record()
+            return super().record(decisions=decisions)
 
     monkeypatch.setattr(sequence_page, "ConsoleConnection", Slow)
     return gate
@@ -323,7 +323,7 @@ def test_a_page_sees_that_its_recording_goes_on_when_it_is_full_and_what_it_has_
     recorder: Recorder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Told(ConsoleConnection):
-        def record(self) -> Iterator[Entries]:
+        def record(self, *, decisions: bool = False) -> Iterator[Entries]:
             entries = [Entry(float(number), "loaded") for number in range(3)]
             return iter([Entries(entries), Entries([], 5), Entries(entries[:1], 7)])
 

@@ -7,7 +7,7 @@ from operator import attrgetter
 
 from msgspec.structs import replace
 
-from rr_actors.base.names import CLIENTS
+from rr_actors.base.names import CONNECTED
 from rr_actors.registrar.core.holding import asked_anew, end_release, load_of, loaded, lose
 from rr_actors.registrar.core.loads.lines import look_again
 from rr_actors.registrar.core.loads.loading import is_to_run
@@ -109,7 +109,7 @@ def _take_back(decision: Decision, registrar: str, query: FetchedQuery) -> None:
     parent does not have it any more. It is of this incarnation: then we have released it, as otherwise we would have
     its row. This registrar was closed since: that releases what a provider has that was away then, except for the parts
     of a resource that could not be unloaded. This registrar is a client's, which begins anew in each run of the
-    system: a client that reconnects loads what it still wants.
+    system: a program that reconnects loads what it still wants.
     """
     catalog = decision.catalog
     peer = catalog.peers.get(registrar)
@@ -117,7 +117,7 @@ def _take_back(decision: Decision, registrar: str, query: FetchedQuery) -> None:
     kept = not query.parent or (parent is not None and parent.attempt == query.attempt)
     wanted = kept and query.response is not None and query.seq <= catalog.since
     wanted = wanted and (parent is not None or peer is None or query.seq > peer.released)
-    wanted = wanted and not catalog.name.startswith(CLIENTS)
+    wanted = wanted and not catalog.name.startswith(CONNECTED)
     hold, resource_id = (Hold.HELD, query.resource_id) if wanted else (Hold.OWED, "")  # as though withdrawn
     place = (registrar, query.server, query.request, query.response, resource_id)
     facts = (query.attempt, query.seq, hold, State(query.state), query.priority, query.own)

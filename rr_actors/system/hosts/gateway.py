@@ -42,7 +42,7 @@ from rr_actors.system.hosts.host_messages import (
 )
 from rr_actors.system.hosts.host_settings import Hosts, named_in, names_of
 from rr_actors.system.hosts.link_relay import Relay
-from rr_actors.system.registrar_lookup import catalogs_on_disk, give_up_clients
+from rr_actors.system.registrar_lookup import catalogs_on_disk, give_up_connected
 from rr_actors.wire.hosts.host_link import HostLink
 from rr_actors.wire.hosts.host_names import REFUSED, UNREACHABLE, UP, HostRow, away, not_exported, put_row, row_of
 from rr_actors.wire.hosts.lease_rows import LeaseRow, boot_id, now_s, read_lease, write_lease
@@ -304,17 +304,17 @@ class _Run:
             if registrar.startswith(prefix) and registrar.removeprefix(prefix) not in peer.exports:
                 self._directory.mark(registrar_key(registrar), Presence.GONE, not_exported(peer.name))
         if peer.row.state != UP and self._giving_up is None:
-            self._giving_up = asyncio.get_running_loop().create_task(self._give_up_clients())
+            self._giving_up = asyncio.get_running_loop().create_task(self._give_up_connected())
         self._set_row(peer, UP, _second(peer))
 
-    async def _give_up_clients(self) -> None:
+    async def _give_up_connected(self) -> None:
         """Release what clients of a killed application have left at other hosts: no gateway ran when this one began."""
         try:
             catalogs = await self._node.dispatcher.workers.run(
                 catalogs_on_disk, self._node.config, Path(self._node.info.state_dir)
             )
             ended = (Presence.DORMANT, Presence.GONE)
-            await give_up_clients(self._node, [name for name in catalogs if self._node.status_of(name) in ended])
+            await give_up_connected(self._node, [name for name in catalogs if self._node.status_of(name) in ended])
         finally:
             self._giving_up = None
 
