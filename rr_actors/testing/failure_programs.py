@@ -6,6 +6,7 @@ import base64
 import dataclasses
 import enum
 import importlib.util
+import math
 import pprint
 import sys
 from collections.abc import Mapping, Sequence
@@ -17,10 +18,12 @@ import msgspec
 from rr_actors.base import pickling
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor
 from rr_actors.testing.scenario_notes import Fault
-from rr_actors.testing.scenario_steps import Step
+from rr_actors.testing.scenario_steps import STEPS, Step
 
 _PLAIN = (type(None), bool, int, float, str, bytes)
 _WIDTH = 100
+_NAMES = ("Path", "base64", "programs", "sys", "play_steps", *(step.__name__ for step in STEPS))
+"""What a program has from elsewhere."""
 
 
 class _Source:
@@ -29,6 +32,7 @@ class _Source:
     def __init__(self) -> None:
         self.imports: set[str] = set()
         self.files: dict[str, str] = {}
+        self._modules = dict.fromkeys(_NAMES, "")  # by the names that are imported from them
 
     def of(self, value: object) -> str:
         """Return an expression for a value; of one that has none, the value's bytes."""
@@ -39,11 +43,15 @@ class _Source:
             return f"programs.value({base64.b85encode(pickling.dumps(value)).decode()!r})"
 
     def _of(self, value: object) -> str:
+        if type(value) is float and not math.isfinite(value):
+            return f"float({str(value)!r})"
         if type(value) in _PLAIN:
             return repr(value)
         if isinstance(value, type):
             return self._named(value)
         if isinstance(value, enum.Enum):
+            if value.name not in type(value).__members__:  # several flags
+                return f"{self._named(type(value))}({self._of(value.value)})"
             return f"{self._named(type(value))}.{value.name}"
         if type(value) in (list, tuple, set):
             items = [self._of(item) for item in cast("Sequence[object]", value)]
@@ -98,15 +106,24 @@ class _Source:
             path = Path(file).resolve()
             module = path.stem
             self.files[module] = str(path)
-        elif importlib.util.find_spec(module) is None:
+        elif not _can_be_imported(module):
             raise _NoSource
         first, _, rest = name.partition(".")
+        if self._modules.setdefault(first, module) != module:
+            raise _NoSource  # the program has another one of this name
         self.imports.add(f"from {module} import {first}")
         if (
             file := getattr(sys.modules.get(module.partition(".")[0]), "__file__", None)
         ) and "site-packages" not in file:
             self.files.setdefault(module.partition(".")[0], file)
         return f"{first}.{rest}" if rest else first
+
+
+def _can_be_imported(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except (ImportError, ValueError):  # a package above it is none, or it has no spec
+        return False
 
 
 class _NoSource(Exception):

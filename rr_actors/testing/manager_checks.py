@@ -392,6 +392,8 @@ class _Search:
             steps, fault = self._last
             story = self._stories[_bytes(steps)]
             raise _fault(self._setup, tuple(steps), fault, self._stage, self._line(), story) from None
+        if not self.scenarios:
+            raise UsageError("check_manager: limit_s: expected time for a scenario, and it was over at the first start")
         if self._stage.loads and not self._stage.loaded:
             expected = f"expected requests that the manager loads, and it refused all {self._stage.loads}"
             raise UsageError(f"check_manager: requests: {expected}; the last: {self._stage.refusal}")

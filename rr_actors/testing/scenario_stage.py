@@ -33,6 +33,7 @@ from rr_actors.base.errors import (
     ResourceBusy,
     ResourceLost,
     RrError,
+    StartFailed,
     Unavailable,
     UnknownQuery,
     UnloadFailed,
@@ -320,7 +321,10 @@ class _Run:
         self._faulty: set[str] = set()  # resources that were FATAL
         self.kills = self.loads = self.loaded = 0
         self._first = self._step_from = len(self._reader.read())
-        self._system.supervisor().restart_child(self._id)
+        try:
+            self._system.supervisor().restart_child(self._id)
+        except StartFailed as error:
+            raise _Broken(Fault(LIVES, f"the next process of the manager did not start: {error}")) from error
         self._handle = self._system.registrar(self._id)
         self._settle()
 
@@ -571,8 +575,10 @@ class _Run:
         self._arm("-", s.Kill(recover_at))
         pid = process_of(self.notes)
         self._killed.add(pid)
+        here = self._system.supervisor()
+        if self._until(lambda: here.which_child(self._id).kill() or None, _RESTART_S) is None:
+            raise _Broken(Fault(LIMIT, "the manager has no process that could be killed"))
         self.kills += 1
-        self._system.ref(self._id).kill()
         self._until(lambda: process_of(self.notes) not in (pid, 0) or None, _RESTART_S)
 
     # -- waiting -----------------------------------------------------------------------------------------------------

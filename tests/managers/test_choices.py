@@ -118,9 +118,10 @@ def test_want_of_means_is_no_fault_of_an_alternative_and_the_search_goes_on_unti
     query = world.choose()
     world.wanting = wanted
     world.say("camera", "FATAL")
-    (warning,) = world.heard.wait()
-    assert warning.state is rr.State.WARNING
-    assert f"; no other one can be started now, and that is tried again: {errno.errorcode[wanted]}: " in warning.message
+    said = f"; no other one can be started now, and that is tried again: {errno.errorcode[wanted]}: "
+    eventually(lambda: any(said in status.message for status in world.heard))
+    told = [status for status in world.heard if not status.message.endswith("the next one is being loaded")]
+    assert [(status.state, said in status.message) for status in told] == [(rr.State.WARNING, True)]
     world.wanting = 0
     world.settled(query, "lidar")
     assert not [status for status in world.heard if status.state is rr.State.FATAL]

@@ -273,6 +273,7 @@ class TakesTheLock(planted.Ports):
         (planted.Ports, st.integers(), {}, ["expected requests that the manager loads", "refused all", "port"]),
         (planted.Ports, DEVICES, {"kills": -1}, ["kills: expected a whole number from 0 on, got -1"]),
         (planted.Ports, DEVICES, {"kills": True}, ["kills: expected a whole number from 0 on, got True"]),
+        (planted.Ports, DEVICES, {"limit_s": 1e-9}, ["limit_s: expected time for a scenario"]),
         (planted.Ports, DEVICES, {"limit_s": 0}, ["limit_s: expected seconds greater than 0, got 0"]),
         (
             planted.Ports,

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from rr_actors.base.errors import UsageError
+from rr_actors.tools.learn.check_process import check_file
 from rr_actors.tools.learn.learn_exercises import all_exercises
 from rr_actors.tools.learn.learn_progress import LearnerFolder
 from rr_actors.tools.module_watcher import SavedFile
@@ -81,6 +82,33 @@ def test_a_reset_keeps_the_learners_text_beside_the_file(folder: Path) -> None:
     assert f"your text is in {FIRST.file_name}.before" in ran.stdout
     assert (folder / f"{FIRST.file_name}.before").read_text() == "mine = 1\n"
     assert (folder / FIRST.file_name).read_text() == FIRST.text
+
+
+def test_a_text_is_kept_however_often_the_file_is_reset(folder: Path) -> None:
+    learner, file = LearnerFolder.open(folder), folder / FIRST.file_name
+
+    assert learner.reset(FIRST) is None  # there is nothing to keep
+    for number, text in enumerate(("first = 1\n", "second = 2\n", "third = 3\n")):
+        file.write_text(text)
+        assert [path and path.name for path in (learner.reset(FIRST), learner.reset(FIRST))] == [
+            f"{file.name}.before{number + 1 if number else ''}",
+            None,
+        ]
+    texts = [(folder / f"{file.name}.before{number}").read_text() for number in ("", 2, 3)]
+    assert texts == ["first = 1\n", "second = 2\n", "third = 3\n"]
+
+
+def test_a_directory_whose_making_was_killed_is_made_to_the_end(folder: Path) -> None:
+    (folder / ".progress.json.4711").write_text("{")
+    for one in all_exercises()[3:]:
+        (folder / one.file_name).unlink()
+    LearnerFolder.begin(folder)
+    assert all((folder / one.file_name).read_text() == one.text for one in all_exercises())
+
+    shutil.rmtree(folder)
+    folder.mkdir()
+    (folder / ".progress.json.4711").write_text("{")
+    assert LearnerFolder.begin(folder).done() == 0
 
 
 # -- files that are wrong ----------------------------------------------------------------------------------------------
@@ -152,6 +180,16 @@ def test_an_exercise_that_does_not_end_is_ended_and_leaves_no_process(folder: Pa
     assert time.monotonic() - began < 40
     (pids,) = re.findall(r"pids (\d+) (\d+)", ran.stdout)
     eventually(lambda: not any(lives(int(pid)) for pid in pids), what=f"the end of {pids}")
+
+
+@pytest.mark.parametrize(
+    "text", ["import subprocess\nsubprocess.Popen(['sleep', '600'])\n", "import os\nos.close(1), os.close(2)\n"]
+)
+def test_a_check_is_over_when_its_process_is(text: str, folder: Path) -> None:
+    (folder / FIRST.file_name).write_text(f"{FIRST.solution}\n{text}")
+
+    found = check_file(FIRST, folder / FIRST.file_name, limit_s=50.0)
+    assert (found.passed, found.what) == (True, "")
 
 
 def test_what_a_file_prints_without_end_is_cut(folder: Path) -> None:

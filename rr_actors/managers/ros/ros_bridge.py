@@ -355,7 +355,7 @@ class RosBridge(Manager):
         if not owner and id in self._switches:
             table = {"error": error_table(action.error)} if action.error is not None else {}
             text = json_of(table or {"query": action.query, "response": action.response})
-            hold = self._book.hold(action.key)  # whoever is answered looks at it
+            hold = self._book.hold(action.key)  # the node that is answered looks at it
             self._available[id](hold is not None and hold.phase == "held" and hold.state != "FATAL")
             for answered in calls:
                 answered(action.error is None, text)

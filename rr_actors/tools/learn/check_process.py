@@ -21,6 +21,7 @@ from rr_actors.tools.learn.scenes import Outcome
 
 LIMIT_S = 30.0
 """The longest time of a check in seconds: then its process is killed, with all processes that it has started."""
+_LOOK_S = 0.02  # between two looks at whether a program has ended
 _AFTER_S = 10.0  # how long what was killed may take to end
 _KEPT = 4000  # bytes of what a file prints
 
@@ -76,13 +77,12 @@ def _run(exercise: Exercise, file: Path, place: Path, limit_s: float) -> Outcome
     assert program.stdout is not None
     printed = b""
     try:
-        printed, is_over = _read(program.stdout, time.monotonic() + limit_s, printed)
-        is_late = not is_over or not _has_ended(program, limit_s)
+        printed, is_late = _watched(program, program.stdout, time.monotonic() + limit_s)
     finally:
         kill_group(program.pid)
         program.wait()
         with contextlib.suppress(KeyboardInterrupt):
-            printed, _ = _read(program.stdout, time.monotonic() + _AFTER_S, printed)  # until its children have ended
+            printed = _read(program.stdout, time.monotonic() + _AFTER_S, printed)[0]  # until its children have ended
         program.stdin.close()
         program.stdout.close()
     found = _outcome(outcome, program.returncode, file, limit_s if is_late else None)
@@ -90,12 +90,20 @@ def _run(exercise: Exercise, file: Path, place: Path, limit_s: float) -> Outcome
     return found
 
 
-def _has_ended(program: subprocess.Popen[bytes], limit_s: float) -> bool:
-    try:
-        program.wait(limit_s)
-    except subprocess.TimeoutExpired:
-        return False
-    return True
+def _watched(program: subprocess.Popen[bytes], output: IO[bytes], until: float) -> tuple[bytes, bool]:
+    """Read what a program prints while it runs, until a time; return the last of it, and whether it still runs.
+
+    The output may stay open after its end, as it is that of its children, too; or be closed before.
+    """
+    printed, is_over = b"", False
+    while program.poll() is None:
+        if time.monotonic() >= until:
+            return printed, True
+        if is_over:
+            time.sleep(_LOOK_S)
+        else:
+            printed, is_over = _read(output, min(until, time.monotonic() + _LOOK_S), printed)
+    return printed, False
 
 
 def _read(output: IO[bytes], until: float, before: bytes) -> tuple[bytes, bool]:

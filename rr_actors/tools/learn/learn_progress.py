@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import getpass
+import itertools
 import os
 import time
 from collections.abc import Sequence
@@ -16,7 +17,8 @@ from rr_actors.base.folder import read_plain
 from rr_actors.tools.learn.learn_exercises import Exercise, all_exercises
 
 FILE = "progress.json"
-_BEFORE = ".before"  # after the name of a file that a reset has moved away
+_NEW = f".{FILE}."  # before the id of the process that writes it
+_BEFORE = ".before"  # after the name of a file that a reset has moved away; further ones have a number
 
 
 class Step(msgspec.Struct):
@@ -67,21 +69,21 @@ class LearnerFolder:
 
     @classmethod
     def begin(cls, path: Path) -> LearnerFolder:
-        """Open a learner's directory; make it, with all files, if it is missing or empty.
+        """Open a learner's directory; make it if it is missing or empty. Add the files of exercises not shown yet.
 
         Raises:
             UsageError: the path names something else, or it cannot be read or written.
         """
-        if (path / FILE).exists() or (path.exists() and not path.is_dir()):
-            return cls.open(path)
         try:
-            if path.is_dir() and any(path.iterdir()):
-                raise _no_folder(path, f"a directory with other files, and without {FILE}")
-            path.mkdir(parents=True, exist_ok=True)
-            folder = cls(path, LearnerProgress(1, _user()))
-            for one in all_exercises():
-                folder.file(one).write_text(one.text, "utf-8")
-            folder.save()
+            if (path / FILE).exists() or (path.exists() and not path.is_dir()):
+                folder = cls.open(path)
+            else:
+                if path.is_dir() and any(not one.name.startswith(_NEW) for one in path.iterdir()):
+                    raise _no_folder(path, f"a directory with other files, and without {FILE}")
+                path.mkdir(parents=True, exist_ok=True)
+                folder = cls(path, LearnerProgress(1, _user()))
+                folder.save()  # first: what a kill leaves here is a learner's directory, and the next call goes on
+            folder._add_files()
         except OSError as error:
             raise _cannot_write(path, error) from error
         return folder
@@ -148,23 +150,29 @@ class LearnerFolder:
         return f"hint {step.hints} of {len(hints)}: {hints[step.hints - 1]}"
 
     def reset(self, exercise: Exercise) -> Path | None:
-        """Restore the file of an exercise as it was given; return where the learner's text is now, if there was one.
+        """Restore the file of an exercise as it was given; return where the learner's text is now, if it was another.
 
         Raises:
             UsageError: the directory cannot be written.
         """
-        file = self.file(exercise)
-        before = file.with_name(file.name + _BEFORE)
+        file, before = self.file(exercise), None
         try:
-            is_there = file.exists()
-            if is_there:
-                file.replace(before)
-            file.write_text(exercise.text, "utf-8")
+            if not file.is_file() or read_plain(file) != exercise.text.encode():
+                if os.path.lexists(file):
+                    before = _free_name(file)
+                    file.replace(before)
+                file.write_text(exercise.text, "utf-8")
         except OSError as error:
             raise _cannot_write(self.path, error) from error
         self.step(exercise).done_at = 0.0
         self.save()
-        return before if is_there else None
+        return before
+
+    def _add_files(self) -> None:
+        """Write the files that are missing, but not of an exercise that the learner has seen: that one was deleted."""
+        for one in all_exercises():
+            if one.name not in self.progress.steps and not os.path.lexists(self.file(one)):
+                self.file(one).write_text(one.text, "utf-8")
 
     def save(self) -> None:
         """Write the progress, whole.
@@ -172,7 +180,7 @@ class LearnerFolder:
         Raises:
             UsageError: the directory cannot be written.
         """
-        new = self.path / f".{FILE}.{os.getpid()}"
+        new = self.path / f"{_NEW}{os.getpid()}"
         try:
             new.write_bytes(msgspec.json.format(msgspec.json.encode(self.progress), indent=1))
             new.replace(self.path / FILE)
@@ -180,6 +188,15 @@ class LearnerFolder:
             with contextlib.suppress(OSError):
                 new.unlink(missing_ok=True)
             raise _cannot_write(self.path, error) from error
+
+
+def _free_name(file: Path) -> Path:
+    """Return a name beside a file that no earlier text has."""
+    name = file.with_name(file.name + _BEFORE)
+    numbers = itertools.count(2)
+    while os.path.lexists(name):
+        name = file.with_name(f"{file.name}{_BEFORE}{next(numbers)}")
+    return name
 
 
 def _no_folder(path: Path, got: str) -> UsageError:
