@@ -20,11 +20,9 @@ from contextvars import ContextVar
 from types import FrameType
 from typing import Any, NamedTuple, cast
 
-import pykka
-
 _PACKAGE = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
 _READY_MADE = os.path.join(_PACKAGE, "managers") + os.sep
-_PYKKA = os.path.dirname(os.path.abspath(pykka.__file__)) + os.sep
+_PYKKA = os.path.join(os.sep, "pykka", "")
 _FRAMES = 4
 _MEND = "serial=True of the class, at_once=1 of a server, or a lock mends it"
 _SITES = 8
@@ -184,7 +182,7 @@ def _races(
 
 def _is_ours(frame: FrameType) -> bool:
     file = frame.f_code.co_filename
-    return file.startswith(_PYKKA) or (file.startswith(_PACKAGE) and not file.startswith(_READY_MADE))
+    return _PYKKA in file or (file.startswith(_PACKAGE) and not file.startswith(_READY_MADE))
 
 
 def _stack(frame: FrameType | None) -> Generator[Place]:
