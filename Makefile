@@ -34,9 +34,9 @@ STAMP := $(VENV)/.installed
 ARGS ?=
 # Tests start a thousand interpreters: where none may keep what it has compiled, each would compile the package again.
 unexport PYTHONDONTWRITEBYTECODE
-# Tests wait more than they compute: two processes for each core, at most four. Those that take long compute more.
+# Tests wait for half of their time or more: three processes for each core, at most six. Those that take long compute more.
 CORES := $(shell getconf _NPROCESSORS_ONLN)
-SIDE_BY_SIDE := -n $(shell echo $$(($(CORES) < 2 ? 2 : 4)))
+SIDE_BY_SIDE := -n $(shell echo $$(($(CORES) < 2 ? 3 : 6)))
 SLOW_SIDE_BY_SIDE := -n $(shell echo $$(($(CORES) < 4 ? $(CORES) + 1 : 4)))
 
 # A test that fails is run once more, and is named where the run ends. More than three of them are a failure

@@ -106,7 +106,7 @@ QUICK: dict[str, Scenario] = {
     "crash": partial(supervision.crashes, 3, 100),
     "children": partial(supervision.children, 10, 1),
     "memory": supervision.memory,
-    "import": partial(importing.importing, 3),
+    "import": partial(importing.importing, 1),
 }
 
 

@@ -17,8 +17,6 @@ import rr_actors as rr
 from support import REPOSITORY, Workshop, kill, lives, wait_gone, wait_respawned
 from support_escapes import WAYS, Escaping, StartProgram, fork_with_setsid
 
-pytestmark = pytest.mark.cold
-
 Start = Callable[..., rr.System]
 
 

@@ -36,8 +36,6 @@ from support import (
 )
 from support_children import hear
 
-pytestmark = pytest.mark.cold
-
 Start = Callable[..., rr.System]
 
 

@@ -76,7 +76,7 @@ def test_async_with_starts_and_stops_a_system_while_the_loop_goes_on(state_dir: 
 
 def test_a_cancelled_async_with_gives_the_start_up_and_leaves_nothing(state_dir: Path) -> None:
     async def program() -> None:
-        system = rr.System([rr.ChildSpec(Slow, id="slow")], state_dir=state_dir)
+        system = rr.System([rr.ChildSpec(Slow, id="slow", shutdown_s=0.2)], state_dir=state_dir)
         with pytest.raises(TimeoutError):
             async with asyncio.timeout(1.0), system:
                 raise AssertionError("it cannot have started")
@@ -137,7 +137,7 @@ def test_a_stop_that_is_cancelled_twice_has_ended_when_it_returns(
 def test_a_start_that_is_cancelled_twice_leaves_nothing(state_dir: Path, caplog: pytest.LogCaptureFixture) -> None:
     async def program() -> None:
         begun = state_dir.parent / "begun"
-        system = rr.System([rr.ChildSpec(Slow, args=(begun,), id="slow")], state_dir=state_dir)
+        system = rr.System([rr.ChildSpec(Slow, args=(begun,), id="slow", shutdown_s=0.2)], state_dir=state_dir)
         starting = asyncio.create_task(system.__aenter__())
         await asyncio.to_thread(eventually, begun.exists)
         for _ in range(3):

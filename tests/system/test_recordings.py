@@ -294,9 +294,9 @@ def test_a_diagram_of_many_messages_without_an_answer_takes_no_longer_for_each()
         many = [
             Entry(n / 1e4, "sent", seq=n, registrar="a", peer="b", name="Noticed", query=str(n)) for n in range(20_000)
         ]
-        began = time.monotonic()
+        began = time.thread_time()
         assert "19,000 more entries" in sequence_of(many)
-        return time.monotonic() - began
+        return time.thread_time() - began
 
     quickly(drawn, 1.0)
 
