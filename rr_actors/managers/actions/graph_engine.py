@@ -219,8 +219,8 @@ class GraphEngine:
         Raises:
             GraphError: the event is none that the graph can have.
             UnknownQuery: the graph is not there any more.
-            CatalogError: it cannot be written, and nothing has happened. Only a Halt or a Pause is told to what runs,
-                and is written as soon as there is room, before anything else: a robot stops also if the disk is full.
+            CatalogError: it cannot be written, and nothing has happened. Only a Halt or a Pause reaches what runs all
+                the same: a robot stops also if the disk is full. It is written when there is room, before all else.
         """
         if not isinstance(event, Begin):
             self._begun.wait()
@@ -272,7 +272,7 @@ class GraphEngine:
             self._runner.tell_run(node.actor, self._key(name, node), word, self._run.steps + 1)
         if is_first:
             self._in_thread(f"{word} later", self._insist_unwritten)
-        text = f"{error}; its actions are told to {word}, and the graph goes on if a crash comes before there is room"
+        text = f"{error}; its actions {word} all the same; the graph goes on if a crash comes before there is room"
         return CatalogError(text, **error.details)
 
     def _write_unwritten(self) -> None:
