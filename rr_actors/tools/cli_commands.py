@@ -106,8 +106,14 @@ def _png(picture: str) -> bytes:
 
 
 def say_json(value: object) -> None:
-    """Print a value as one line of JSON."""
-    typer.echo(json_text(json.dumps(msgspec.to_builtins(value), ensure_ascii=False)))
+    """Print a value as one line of JSON. It has null in the place of numbers that JSON has not: NaN and infinity."""
+    plain = msgspec.to_builtins(value)
+    try:
+        line = json.dumps(plain, ensure_ascii=False, allow_nan=False)
+    except ValueError:
+        known = json.loads(json.dumps(plain), parse_constant=lambda _: None)
+        line = json.dumps(known, ensure_ascii=False)
+    typer.echo(json_text(line))
 
 
 def json_text(line: str) -> str:

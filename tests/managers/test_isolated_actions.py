@@ -210,7 +210,7 @@ def test_a_run_that_hangs_is_killed_when_its_graph_is_released(world: World) -> 
     graph = world.app.load("actions/graph", RunGraph(world.graph("Hang")), timeout_s=LIMIT_S)
     (pid,) = world.started()
     graph.unload(timeout_s=LIMIT_S)
-    ends(pid)
+    assert not is_alive(pid)
     eventually(lambda: not world.system.registrar("actions").resources(), LIMIT_S, "all released")
 
 

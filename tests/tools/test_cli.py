@@ -14,6 +14,7 @@ import pytest
 
 from rr_actors.registrar.model.rows import Held, Hold, Notice, Peer, Phase, Put, Resource, Row, ServedQuery, State
 from rr_actors.storage.opening import open_store
+from rr_actors.tools.cli_commands import say_json
 from rr_actors.tools.inspection import check, read_state
 from support_cli import run_cli
 
@@ -84,6 +85,11 @@ def test_inspect_as_json_is_for_programs(state: Path) -> None:
     query = {"id": "q1", "origin": "app", "parent": "", "priority": 0}
     assert shown["cameras"]["resources"][0]["queries"] == [query]
     assert (shown["app"]["held"][0]["registrar"], shown["app"]["held"][0]["priority"]) == ("cameras", 0)
+
+
+def test_json_has_null_for_a_number_that_json_has_not(capsys: pytest.CaptureFixture[str]) -> None:
+    say_json({"row": [float("nan"), float("inf"), 1.5, "NaN ä"]})
+    assert capsys.readouterr().out == '{"row": [null, null, 1.5, "NaN ä"]}\n'
 
 
 def test_tree_shows_dependencies_below_what_depends_on_them(state: Path) -> None:

@@ -45,6 +45,7 @@ _SMALL = 20
 _RESPONSE_S = 0.005
 """The response of a graph with more actions than _SMALL is written at most once in so many seconds for each action."""
 _AGAIN_S = 1.0
+_KILLED_S = 2.0  # the kill of an isolated run that does not stop begins when its time is over; it is waited for
 _MOST_TEXTS = 10  # the newest, of the transitions that one status is about
 CONFIRMED_S = 5.0
 """How long a message waits until the managers of the runs have confirmed what they were told."""
@@ -219,8 +220,8 @@ class GraphEngine:
         Raises:
             GraphError: the event is none that the graph can have.
             UnknownQuery: the graph is not there any more.
-            CatalogError: it cannot be written, and nothing has happened. What runs hears of a Halt or a Pause alone,
-                and is written as soon as there is room, before anything else: a robot stops also if the disk is full.
+            CatalogError: it cannot be written, and nothing has happened. Only a Halt or a Pause reaches what runs all
+                the same: a robot stops also if the disk is full. It is written when there is room, before all else.
         """
         if not isinstance(event, Begin):
             self._begun.wait()
@@ -272,7 +273,7 @@ class GraphEngine:
             self._runner.tell_run(node.actor, self._key(name, node), word, self._run.steps + 1)
         if is_first:
             self._in_thread(f"{word} later", self._insist_unwritten)
-        text = f"{error}; its actions hear {word!r}; the graph goes on if a crash comes before there is room"
+        text = f"{error}; its actions {word} all the same; the graph goes on if a crash comes before there is room"
         return CatalogError(text, **error.details)
 
     def _write_unwritten(self) -> None:
@@ -349,11 +350,18 @@ class GraphEngine:
                 self._log.close()
         for name, node in _live(run):
             self._runner.tell_run(node.actor, self._key(name, node), "stop", run.steps + 1)
-        deadline = time.monotonic() + stop_s
+        is_any_isolated = any(self._is_isolated(name, node) for name, node in _live(run))
+        deadline = time.monotonic() + stop_s + (_KILLED_S if is_any_isolated else 0.0)
         for thread in threads:
             thread.join(max(0.0, deadline - time.monotonic()))
             if thread.is_alive():
                 logger.warning("%s: %s has not ended within %g s of stopping", self._graph.name, thread.name, stop_s)
+
+    def _is_isolated(self, name: str, node: NodeRun) -> bool:
+        """Return whether an action runs here in a process of its own, which is killed if it does not stop."""
+        known = self._graph.nodes.get(name)
+        kind = None if known is None or node.actor else self.shelf.actions.get(known.action)
+        return kind is not None and kind.isolate
 
     # -- on disk ---------------------------------------------------------------------------------------------------
 
