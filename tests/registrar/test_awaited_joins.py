@@ -139,8 +139,8 @@ def test_what_is_held_after_a_ctrl_c_among_awaited_loads_is_what_the_provider_ha
     app.load("provider/thing", "x").unload()
     for delay_s in (0.01, 0.013, 0.017, 0.019, 0.023):
         timer = threading.Timer(delay_s, os.kill, (os.getpid(), signal.SIGINT))
-        timer.start()
         with pytest.raises(KeyboardInterrupt):
+            timer.start()
             asyncio.run(main())
         timer.join()
         eventually(lambda: agree(app, provider))
