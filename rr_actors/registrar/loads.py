@@ -53,7 +53,7 @@ CALL_TIMEOUT_S = 30.0
 """Seconds for which a thread waits until the loop has answered a short call."""
 
 _NOTED = 256
-"""So many calls without waiting are known, before those that are answered are forgotten."""
+"""So many calls without waiting are noted, before those that are answered are forgotten."""
 
 _ANSWERS_AT_ONCE = 16
 """The most answers of this process to tasks that come without a turn of their event loop."""
@@ -76,6 +76,7 @@ class Calls:
         # no references: a closed event loop never ends its turn, and would keep its task
         self._turn: tuple[weakref.ref[asyncio.AbstractEventLoop], weakref.ref[asyncio.Task[Any]]] | None = None
         self._unawaited: dict[tuple[int, str], weakref.ref[Reply[Any]]] = {}  # the last of each sender and provider
+        self._many = _NOTED
 
     def check_open(self) -> None:
         """Raise RegistrarDown if the registrar is closed."""
@@ -124,10 +125,11 @@ class Calls:
 
     def note_unawaited(self, provider: str, future: Reply[Any]) -> None:
         """Note that the calling thread, or task, goes on while the loop sends what it has asked of a provider."""
-        if len(self._unawaited) >= _NOTED:
+        if len(self._unawaited) >= self._many:
             for key, noted in list(self._unawaited.items()):
                 if (other := noted()) is None or other.done():
                     self._unawaited.pop(key, None)
+            self._many = max(_NOTED, 2 * len(self._unawaited))
         self._unawaited[_sender(), provider] = weakref.ref(future)
 
     def _would_overtake(self, provider: str) -> bool:

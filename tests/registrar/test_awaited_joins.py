@@ -131,7 +131,8 @@ def test_tasks_threads_and_futures_agree_on_what_is_held(system: rr.System, opti
 def test_what_is_held_after_a_ctrl_c_among_awaited_loads_is_what_the_provider_has(
     app: rr.Registrar, provider: rr.Registrar, served: Served
 ) -> None:
-    async def main() -> None:
+    async def main(timer: threading.Timer) -> None:
+        timer.start()
         while True:
             query = await app.load_async("provider/thing", "x")
             await query.unload_async()
@@ -139,9 +140,8 @@ def test_what_is_held_after_a_ctrl_c_among_awaited_loads_is_what_the_provider_ha
     app.load("provider/thing", "x").unload()
     for delay_s in (0.01, 0.013, 0.017, 0.019, 0.023):
         timer = threading.Timer(delay_s, os.kill, (os.getpid(), signal.SIGINT))
-        timer.start()
         with pytest.raises(KeyboardInterrupt):
-            asyncio.run(main())
+            asyncio.run(main(timer))
         timer.join()
         eventually(lambda: agree(app, provider))
     assert len(app.queries()) == 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import faulthandler
 import random
 import threading
 import time
@@ -570,6 +571,7 @@ class Counter(rr.Manager, serial=True):
 def test_of_many_loads_unloads_messages_and_timers_one_is_inside_at_a_time(
     start: Start, count: int, placement: Placement
 ) -> None:
+    faulthandler.cancel_dump_traceback_later()  # pytest's, which is for shorter tests: it may crash a busy process
     system = start(rr.ChildSpec(Counter, id="counter", placement=placement))
     app, counter = system.open_registrar("app"), system.ref("counter")
     limit_s = 20 * LIMIT_S

@@ -69,6 +69,11 @@ def verify(place: Path, *children: str) -> tuple[int, str]:
     (place / "robots.py").write_text(MODULE)
     entries = (child.split() for child in children)
     tree = "".join(f'[[children]]\nactor = "robots:{cls}"\nid = "{id}"\n' for cls, id in entries)
+    return verify_text(place, tree)
+
+
+def verify_text(place: Path, tree: str) -> tuple[int, str]:
+    """Verify a tree of these lines, beside MODULE."""
     (place / "tree.toml").write_text(tree)
     program = "from rr_actors.tools.cli import main; main()"
     command = [sys.executable, "-c", program, "verify", "tree.toml"]
@@ -94,6 +99,17 @@ def test_an_on_start_that_waits_for_a_later_child_is_found_with_both_names_and_t
 @pytest.mark.parametrize("cls", WAITS)
 def test_a_tree_in_its_right_order_is_not_complained_of(tmp_path: Path, cls: str) -> None:
     assert verify(tmp_path, "Cameras cameras", f"{cls} first") == (0, "")
+
+
+def test_an_on_start_in_a_nested_supervisor_is_compared_with_what_its_uncles_have(tmp_path: Path) -> None:
+    (tmp_path / "robots.py").write_text(MODULE)
+    group = '[[children]]\nid = "{0}"\n[[children.children]]\nactor = "robots:{1}"\nid = "{2}"\n'
+    first, later = group.format("inner", "Loads", "maps"), group.format("later", "Cameras", "cameras")
+    code, said = verify_text(tmp_path, first + later)
+    assert code == 1
+    assert "root/later/cameras starts after root/inner/maps, whose on_start loads cameras/camera" in said
+    assert "put 'later' before 'inner' in the list of root" in said
+    assert verify_text(tmp_path, later + first) == (0, "")
 
 
 def test_what_on_start_begins_and_does_not_wait_for_is_not_complained_of(tmp_path: Path) -> None:
