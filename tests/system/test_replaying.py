@@ -20,7 +20,9 @@ from rr_actors.registrar.decisions.decided import Began, Decided
 from rr_actors.registrar.model.catalog import Decision
 from rr_actors.registrar.model.effects import SendReply
 from rr_actors.registrar.model.messages import Load, Loaded
-from rr_actors.registrar.model.recorded import DECIDED
+from rr_actors.registrar.model.recorded import DECIDED, Entry
+from rr_actors.system.console.console_feed import Reader
+from rr_actors.system.console.console_messages import ANSWER_LIMIT_BYTES, BeginRecording, Entries
 from rr_actors.system.rewound.decision_texts import facts_of, step_lines
 from rr_actors.system.rewound.replaying import Replay, replay
 from rr_actors.system.rewound.rewinding import rewind
@@ -321,18 +323,34 @@ def test_a_system_of_another_process_is_recorded_with_its_decisions(
 ) -> None:
     file = tmp_path / "live.jsonl"
     ran: list[Any] = []
-    words = ("record", file, "--decisions", "--seconds", "1", "--state", state_dir)
+    words = ("record", file, "--decisions", "--state", state_dir)
     thread = threading.Thread(target=lambda: ran.append(run_cli(*words)))
     thread.start()
     level = actor_of(app).watched.level
     eventually(lambda: level[0] >= 4, what="the recording has begun")
     app.load("provider/thing", "y").unload()
+
+    eventually(lambda: '"name":"Unloaded"' in file.read_text(), what="the answer is in the file")
+    system.stop()
     thread.join(30)
 
     assert ran[0].returncode == 0
     found = replay(file)
     assert "Load" in items_of(found, "provider")
     assert (found.differences, found.not_decided) == ([], [])
+
+
+def test_long_notes_fit_into_the_frames_of_a_console() -> None:
+    frames: list[bytes] = []
+    reader = Reader(BeginRecording(decisions=True), frames.append, lambda: None)
+    note = {"number": 1, "part": 1, "parts": 1, "note": "n" * 65_536}
+    entries = [Entry(1.0, DECIDED, seq, registrar="app", facts=note) for seq in range(200)]
+    reader.take(entries, 0)
+    reader.flush()
+
+    sent = [msgspec.msgpack.decode(frame[4:], type=Entries) for frame in frames]
+    assert [entry for part in sent for entry in part.entries] == entries
+    assert max(map(len, frames)) <= ANSWER_LIMIT_BYTES
 
 
 def test_the_command_counts_lists_and_shows(recorded: Path) -> None:
