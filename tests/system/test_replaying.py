@@ -14,10 +14,11 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.base.errors import ConfigError
-from rr_actors.registrar.core import decide as deciding
-from rr_actors.registrar.core.loads import loading
+from rr_actors.registrar.core.decide import Item, decide
+from rr_actors.registrar.decisions import deciding_again
 from rr_actors.registrar.decisions.decided import Began, Decided
-from rr_actors.registrar.model.catalog import Decision
+from rr_actors.registrar.engine import registrar_state
+from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.effects import SendReply
 from rr_actors.registrar.model.messages import Load, Loaded
 from rr_actors.registrar.model.recorded import DECIDED, Entry
@@ -125,11 +126,14 @@ def items_of_step(what: Began | Decided) -> list[str]:
 def test_where_todays_code_decides_in_another_way_is_found_and_said(
     recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def twice(decision: Decision, message: Load) -> None:
-        loading.load(decision, message)
-        decision.cause(SendReply(message.origin, Loaded(message.query_id, "nothing", b"")))
+    def twice(catalog: Catalog, items: list[Item]) -> Decision:
+        decision = decide(catalog, items)
+        for item, _ in items:
+            if type(item) is Load:
+                decision.cause(SendReply(item.origin, Loaded(item.query_id, "nothing", b"")))
+        return decision
 
-    monkeypatch.setitem(deciding._MESSAGES, Load, twice)  # pyright: ignore[reportPrivateUsage]
+    monkeypatch.setattr(deciding_again, "decide", twice)
     found = replay(recorded)
 
     (step,) = found.differences
@@ -148,18 +152,20 @@ def test_where_todays_code_decides_in_another_way_is_found_and_said(
 def test_a_defect_of_the_field_is_seen_and_that_it_is_mended(
     system: rr.System, app: rr.Registrar, served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fails(_decision: Decision, _message: Load) -> None:
-        raise ZeroDivisionError("of the field")
+    def fails(catalog: Catalog, items: list[Item]) -> Decision:
+        if type(items[0][0]) is Load:
+            raise ZeroDivisionError("of the field")
+        return decide(catalog, items)
 
     with monkeypatch.context() as patch, system.record(decisions=True) as recording:
-        patch.setitem(deciding._MESSAGES, Load, fails)  # pyright: ignore[reportPrivateUsage]
+        patch.setattr(registrar_state, "decide", fails)
         with pytest.raises(rr.RrError):
             app.load("provider/thing", "y", timeout_s=10.0)
     (step,) = replay(recording).differences
     assert (step.differences[0].of, step.differences[0].today) == ("error", None)
     assert step.differences[0].recorded == "ZeroDivisionError: of the field"
 
-    monkeypatch.setitem(deciding._MESSAGES, Load, fails)  # pyright: ignore[reportPrivateUsage]
+    monkeypatch.setattr(deciding_again, "decide", fails)
     assert replay(recording).differences == []
 
 
