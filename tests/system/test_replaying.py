@@ -205,6 +205,18 @@ def test_a_catalog_that_is_read_again_begins_anew(
     assert (found.differences, found.not_decided) == ([], [])
 
 
+def test_a_registrar_that_is_closed_and_opened_again_begins_anew(system: rr.System, served: Served) -> None:
+    with system.record(decisions=True) as recording:
+        for _ in range(2):
+            guest = system.open_registrar("guest")
+            guest.load("provider/thing", "y").unload()
+            guest.close()
+
+    found = replay(recording)
+    assert sum(isinstance(step.what, Began) for step in found.of("guest")) == 2
+    assert (found.differences, found.not_decided, found.notes) == ([], [], [])
+
+
 def lines_of(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
