@@ -38,15 +38,15 @@ SELDOM = {
 }  # fmt: skip
 """What only some programs need, or only the command line, the managers for external programs, a file to be read."""
 
-MOST_MODULES = 382
+MOST_MODULES = 385
 """Each takes a quarter of a millisecond. Ten are the console's, which each system has by default; one is the web
 page's, four draw pictures for notebooks, ten are the two ends of streams, six are a registrar's servers with their
 room, two are the backup's, one notes the messages between actors, four look at mailboxes and pause them, two make
 children processes of multiprocessing, with its `util`, and one remembers what happened. Two are for loads that wait
 in line, with their room, three for what is asked from outside, with theirs, and one is for systemd. Six say what needs
 attention, and what a kill would do. Two are for tables that actors declare, one keeps the times of loads, and one says
-what a registrar would do. One is `_tokenize`, of Python 3.12 and later. 128 of them come with asyncio, sqlite3,
-msgspec, pykka and cloudpickle."""
+what a registrar would do. Three are for the notes of what registrars decide, with their room. One is `_tokenize`, of
+Python 3.12 and later. 128 of them come with asyncio, sqlite3, msgspec, pykka and cloudpickle."""
 
 BARE_MODULES = 12
 """Of the import alone: what decides which module a name is in, and leaves the garbage collector alone meanwhile."""
@@ -54,7 +54,7 @@ BARE_MODULES = 12
 HELP_MODULES = 127
 """Of `rr-actors --help`, and a TAB for a verb: typer's, msgspec's, and a few of the base."""
 
-PS_MODULES = 424
+PS_MODULES = 427
 """Of `rr-actors ps`, and a TAB for one of its options: these and the console's, which are nearly all of a system."""
 
 USED = "import rr_actors as rr; rr.System; rr.Manager; rr.Supervisor; rr.Actor; rr.connect"

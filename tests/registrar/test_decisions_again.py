@@ -106,6 +106,11 @@ def test_a_course_of_decisions_leads_to_what_the_registrar_knows_then() -> None:
     notes.decide(catalog, [(c.SetStatus("q1", "event", State.ERROR, "dust", notes.decide), None)])
     notes.decide(catalog, [(Unload("q1", "app"), "app")], recording=2)
 
+    again, values = DecidedAgain(), notes.values
+    again.begin(values[0])
+    for one in values[1:6]:
+        again.decide(one)
+    assert values == notes.values, "what was noted stays as it was"
     assert [type(one) for one in notes.values] == [Began, *[Decided] * 5, Began, Decided]
     assert notes.values[5].outside == {"listened": ({"q1": True}, []), "servers": ({"lens": Server("lens")}, [])}
     assert notes.again()[0] == notes.again()[6] == ()

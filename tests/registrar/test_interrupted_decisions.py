@@ -255,6 +255,7 @@ def test_what_is_noted_of_a_decision_that_is_interrupted_leads_to_what_is_known(
             else:
                 assert again.decide(note).differences == (), f"{name}: interrupted at {place}"
                 assert note.end == "raised" or again.is_known
+        assert again.is_known
         last = notes[-1]
         assert not isinstance(last, Began)
         assert last.items == [tell(c.AddInFlight())]

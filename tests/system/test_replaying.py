@@ -14,13 +14,16 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.base.errors import ConfigError
-from rr_actors.registrar.core import decide as deciding
-from rr_actors.registrar.core.loads import loading
+from rr_actors.registrar.core.decide import Item, decide
+from rr_actors.registrar.decisions import deciding_again
 from rr_actors.registrar.decisions.decided import Began, Decided
-from rr_actors.registrar.model.catalog import Decision
+from rr_actors.registrar.engine import registrar_state
+from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.effects import SendReply
 from rr_actors.registrar.model.messages import Load, Loaded
-from rr_actors.registrar.model.recorded import DECIDED
+from rr_actors.registrar.model.recorded import DECIDED, Entry
+from rr_actors.system.console.console_feed import Reader
+from rr_actors.system.console.console_messages import ANSWER_LIMIT_BYTES, BeginRecording, Entries
 from rr_actors.system.rewound.decision_texts import facts_of, step_lines
 from rr_actors.system.rewound.replaying import Replay, replay
 from rr_actors.system.rewound.rewinding import rewind
@@ -123,11 +126,14 @@ def items_of_step(what: Began | Decided) -> list[str]:
 def test_where_todays_code_decides_in_another_way_is_found_and_said(
     recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def twice(decision: Decision, message: Load) -> None:
-        loading.load(decision, message)
-        decision.cause(SendReply(message.origin, Loaded(message.query_id, "nothing", b"")))
+    def twice(catalog: Catalog, items: list[Item]) -> Decision:
+        decision = decide(catalog, items)
+        for item, _ in items:
+            if type(item) is Load:
+                decision.cause(SendReply(item.origin, Loaded(item.query_id, "nothing", b"")))
+        return decision
 
-    monkeypatch.setitem(deciding._MESSAGES, Load, twice)  # pyright: ignore[reportPrivateUsage]
+    monkeypatch.setattr(deciding_again, "decide", twice)
     found = replay(recorded)
 
     (step,) = found.differences
@@ -146,18 +152,20 @@ def test_where_todays_code_decides_in_another_way_is_found_and_said(
 def test_a_defect_of_the_field_is_seen_and_that_it_is_mended(
     system: rr.System, app: rr.Registrar, served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fails(_decision: Decision, _message: Load) -> None:
-        raise ZeroDivisionError("of the field")
+    def fails(catalog: Catalog, items: list[Item]) -> Decision:
+        if type(items[0][0]) is Load:
+            raise ZeroDivisionError("of the field")
+        return decide(catalog, items)
 
     with monkeypatch.context() as patch, system.record(decisions=True) as recording:
-        patch.setitem(deciding._MESSAGES, Load, fails)  # pyright: ignore[reportPrivateUsage]
+        patch.setattr(registrar_state, "decide", fails)
         with pytest.raises(rr.RrError):
             app.load("provider/thing", "y", timeout_s=10.0)
     (step,) = replay(recording).differences
     assert (step.differences[0].of, step.differences[0].today) == ("error", None)
     assert step.differences[0].recorded == "ZeroDivisionError: of the field"
 
-    monkeypatch.setitem(deciding._MESSAGES, Load, fails)  # pyright: ignore[reportPrivateUsage]
+    monkeypatch.setattr(deciding_again, "decide", fails)
     assert replay(recording).differences == []
 
 
@@ -195,6 +203,18 @@ def test_a_catalog_that_is_read_again_begins_anew(
     found = replay(recording)
     assert sum(isinstance(step.what, Began) for step in found.of("provider")) == 2
     assert (found.differences, found.not_decided) == ([], [])
+
+
+def test_a_registrar_that_is_closed_and_opened_again_begins_anew(system: rr.System, served: Served) -> None:
+    with system.record(decisions=True) as recording:
+        for _ in range(2):
+            guest = system.open_registrar("guest")
+            guest.load("provider/thing", "y").unload()
+            guest.close()
+
+    found = replay(recording)
+    assert sum(isinstance(step.what, Began) for step in found.of("guest")) == 2
+    assert (found.differences, found.not_decided, found.notes) == ([], [], [])
 
 
 def lines_of(path: Path) -> list[dict[str, Any]]:
@@ -321,18 +341,34 @@ def test_a_system_of_another_process_is_recorded_with_its_decisions(
 ) -> None:
     file = tmp_path / "live.jsonl"
     ran: list[Any] = []
-    words = ("record", file, "--decisions", "--seconds", "1", "--state", state_dir)
+    words = ("record", file, "--decisions", "--state", state_dir)
     thread = threading.Thread(target=lambda: ran.append(run_cli(*words)))
     thread.start()
     level = actor_of(app).watched.level
     eventually(lambda: level[0] >= 4, what="the recording has begun")
     app.load("provider/thing", "y").unload()
+
+    eventually(lambda: '"name":"Unloaded"' in file.read_text(), what="the answer is in the file")
+    system.stop()
     thread.join(30)
 
     assert ran[0].returncode == 0
     found = replay(file)
     assert "Load" in items_of(found, "provider")
     assert (found.differences, found.not_decided) == ([], [])
+
+
+def test_long_notes_fit_into_the_frames_of_a_console() -> None:
+    frames: list[bytes] = []
+    reader = Reader(BeginRecording(decisions=True), frames.append, lambda: None)
+    note = {"number": 1, "part": 1, "parts": 1, "note": "n" * 65_536}
+    entries = [Entry(1.0, DECIDED, seq, registrar="app", facts=note) for seq in range(200)]
+    reader.take(entries, 0)
+    reader.flush()
+
+    sent = [msgspec.msgpack.decode(frame[4:], type=Entries) for frame in frames]
+    assert [entry for part in sent for entry in part.entries] == entries
+    assert max(map(len, frames)) <= ANSWER_LIMIT_BYTES
 
 
 def test_the_command_counts_lists_and_shows(recorded: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import msgspec
 
@@ -79,7 +79,7 @@ def all_of(catalog: Catalog, *, again: bool = False) -> Began:
 
 
 def catalog_of(began: Began) -> Catalog:
-    """Return a new catalog that knows the same.
+    """Return a new catalog that knows the same, and changes nothing of what was noted.
 
     Raises:
         AttributeError: a catalog of this version has no such memory.
@@ -88,8 +88,15 @@ def catalog_of(began: Began) -> Catalog:
     for name, value in began.memory.items():
         known: Any = getattr(catalog, name)
         is_made = isinstance(known, defaultdict)  # by_request: dicts in a dict
-        setattr(catalog, name, defaultdict(dict, value) if is_made else value)
+        setattr(catalog, name, defaultdict(dict, _own(value)) if is_made else _own(value))
     return catalog
+
+
+def _own(value: Any) -> Any:
+    """Return a copy of what a catalog would change: dicts in dicts, and sets."""
+    if isinstance(value, dict):
+        return {key: _own(one) for key, one in cast("dict[Any, Any]", value).items()}
+    return set(cast("set[Any]", value)) if isinstance(value, set) else value
 
 
 def apply_outside(catalog: Catalog, outside: Outside) -> None:

@@ -11,7 +11,6 @@ from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core.decide import Item
 from rr_actors.registrar.decisions.decided import OUTSIDE, Decided, Outside, all_of, copied, outside_of
-from rr_actors.registrar.decisions.typed_values import text_from
 from rr_actors.registrar.model.catalog import Catalog, Decision
 
 logger = Log("rr_actors.registrar")
@@ -102,6 +101,8 @@ class DecisionNotes:
         self._begun = None  # at last: after an interrupt before this, the next note has all
 
     def _note(self, what: Any) -> None:
+        from rr_actors.registrar.decisions.typed_values import text_from  # its tables, which few programs need
+
         try:
             text = text_from(what)
             parts = [text[at : at + PART] for at in range(0, len(text), PART)]
