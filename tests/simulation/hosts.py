@@ -93,6 +93,10 @@ class SimHosts:
         """Have the gateway of a provider hear a heartbeat."""
         given.hear(self.clock(host))
 
+    def knows(self, host: str) -> bool:
+        """Return whether a gateway that was started again may say now which hosts have no lease."""
+        return float("-inf") < self.known_from[host] <= self.clock(host)
+
     def acknowledge(self, lease: TakenLease, _host: str, number: int) -> None:
         """Have the gateway of a consumer hear that a heartbeat was heard."""
         lease.acknowledged(number, LEASE_S)
@@ -307,11 +311,11 @@ class Hosted(Lives):
                     self.tell_over(consumer, provider.name, runs[provider.name])
 
     def _unlink_consumer(self, consumer: SimRegistrar, provider: str) -> None:
-        peering = consumer.clients.pop(provider, None)
+        peering = consumer.clients.get(provider)
         if peering is not None:
-            self.todo.discard(("net", consumer.name, provider, TO_CONSUMER))
             self._cut(consumer.name, provider, peering.link, (1_000_000, 0))
-            consumer.post(c.LinkLost(provider))
+            self.todo.discard(("net", consumer.name, provider, TO_CONSUMER))
+            consumer.unlinked(provider)
         self._break_lines_between(consumer.name, provider)
 
     def _break_lines_between(self, consumer: str, provider: str) -> None:
@@ -321,14 +325,17 @@ class Hosted(Lives):
 
     def tell_over(self, consumer: SimRegistrar, provider: str, run: int) -> None:
         """Have a registrar decide that its lease is over, and hear so."""
-        catalog = consumer.catalog
-        if provider not in catalog.outbound and provider not in {held.registrar for held in catalog.in_flight.values()}:
-            return
-        rows = (*catalog.held.values(), *catalog.in_flight.values())
-        self.hosts.lapsed.update(held.id for held in rows if held.registrar == provider)
-        consumer.post(c.LeaseOver(provider, run, "the lease is over", self.new_event()))
-        while consumer.inbox and not consumer.disk_is_full and consumer.state in ("up", "starting"):
-            self.wake(consumer.name)
+        self._take_up(consumer)
+        rows = (*consumer.catalog.held.values(), *consumer.catalog.in_flight.values())
+        held = [row.id for row in rows if row.registrar == provider]
+        if held or provider in consumer.catalog.peers:
+            self.hosts.lapsed.update(held)
+            consumer.post(c.LeaseOver(provider, run, "the lease is over", self.new_event()))
+            self._take_up(consumer)
+
+    def _take_up(self, registrar: SimRegistrar) -> None:
+        while registrar.inbox and not registrar.disk_is_full and registrar.state in ("up", "starting"):
+            self.wake(registrar.name)
 
     def up(self, name: str) -> bool:
         if not super().up(name):
@@ -386,7 +393,7 @@ class Hosted(Lives):
     def known(self, b: str) -> bool:
         """A gateway that was started again says which hosts have not come for the time of a lease."""
         hosts = self.hosts
-        if hosts.known_from[b] == float("-inf") or hosts.clock(b) < hosts.known_from[b] or b in hosts.frozen:
+        if not hosts.knows(b) or b in hosts.frozen:
             return False
         hosts.known_from[b] = float("-inf")
         for provider in self.on(b):
