@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 
-from rr_actors.registrar.core import decide as deciding
-from rr_actors.registrar.core import leases as deciding_leases
+from rr_actors.registrar.core import reconciliation
 from rr_actors.registrar.model.catalog import Decision, Server
 from rr_actors.registrar.model.commands import LeaseOver
 from rr_actors.wire.hosts import leases
@@ -20,6 +19,7 @@ from simulation.process_faults import HOSTS_FIRST
 from simulation.quiescence import come_to_rest
 from simulation.runner import kind_of
 from simulation.world import Step, World
+from support_mutations import in_tables
 
 Patch = Callable[[object, str, Any], None]
 
@@ -98,19 +98,18 @@ def lets_in_too_early(patch: Patch) -> None:
 
 def tells_nobody(patch: Patch) -> None:
     """The consumer's registrars do not hear that the lease is over."""
-    commands = {**deciding._COMMANDS, LeaseOver: lambda _decision, _command: None}  # pyright: ignore[reportPrivateUsage]
-    patch(deciding, "_COMMANDS", commands)
+    in_tables(patch, reconciliation.lease_over, lambda _decision, _command: None)
 
 
 def takes_late_answers(patch: Patch) -> None:
     """An answer that comes to a thread from an ended lease counts."""
+    plain = reconciliation.lease_over
 
     def lease_over(decision: Decision, command: LeaseOver) -> None:
-        deciding_leases.lease_over(decision, command)
+        plain(decision, command)
         decision.forget(decision.catalog.lapsed, command.registrar)
 
-    commands = {**deciding._COMMANDS, LeaseOver: lease_over}  # pyright: ignore[reportPrivateUsage]
-    patch(deciding, "_COMMANDS", commands)
+    in_tables(patch, plain, lease_over)
 
 
 def knows_at_once(patch: Patch) -> None:
@@ -118,10 +117,9 @@ def knows_at_once(patch: Patch) -> None:
     patch(SimHosts, "unknown_s", lambda _hosts: 0.0)
 
 
-def renews_what_is_over(patch: Patch) -> None:
-    """The consumer does not notice that its lease is over while no link is there."""
-    plain = TakenLease.is_over
-    patch(TakenLease, "is_over", lambda lease, now: plain(lease, now) and bool(lease._sent))  # pyright: ignore[reportPrivateUsage]
+def looks_too_rarely(patch: Patch) -> None:
+    """The consumer does not look whether its lease is over."""
+    patch(Hosted, "end_leases", lambda _world: None)
 
 
 MUTATIONS: dict[str, Callable[[Patch], None]] = {
@@ -129,8 +127,6 @@ MUTATIONS: dict[str, Callable[[Patch], None]] = {
     "a gap ignored": ignores_gaps,
     "let in before it is released": lets_in_too_early,
     "nobody told": tells_nobody,
-    "an end not noticed without a link": renews_what_is_over,
-    "released at once": lambda patch: patch(GivenLease, "is_over", lambda _lease, _now: True),
 }
 
 
@@ -175,6 +171,12 @@ DIRECTED: dict[str, tuple[Callable[[Patch], None], str, list[Step]]] = {
         "leases",
         [*HELD, PARTED, ("tick", 103), ("lapse", "h1", "h0"), ("fence", CAM), ("wake", CAM)],
     ),
+    "released at once": (
+        lambda patch: patch(GivenLease, "is_over", lambda _lease, _now: True),
+        "leases",
+        [*HELD, ("lapse", "h1", "h0"), ("fence", CAM), ("wake", CAM)],
+    ),
+    "an end not looked for": (looks_too_rarely, "leases", [*HELD, PARTED, *OVER]),
     "a fence forgotten": (
         forgets_its_fence,
         "fence",

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Any, NamedTuple
 
-from rr_actors.registrar.core.leases import is_fenced
+from rr_actors.registrar.core.reconciliation import is_fenced
 from rr_actors.registrar.links.consumer_links import GATEWAY
 from rr_actors.registrar.links.provider_link import LEASE_BITS
 from rr_actors.registrar.model import commands as c
@@ -133,7 +133,7 @@ class Hosted(Lives):
         """Have all hosts run and reach each other, with leases that go on."""
         for host in list(self.hosts.frozen):
             self.thaw(host)
-        self._end_leases()
+        self.end_leases()
         for a, b in self.hosts.taken:
             given = self.hosts.given[b].get(a)
             if given is not None and given.is_over(self.hosts.clock(b)):
@@ -182,7 +182,7 @@ class Hosted(Lives):
         if not self.hosts.names:
             return False
         self.hosts.now += tenths * _TENTH_S
-        self._end_leases()
+        self.end_leases()
         return True
 
     def meet(self, a: str, b: str) -> bool:
@@ -265,7 +265,7 @@ class Hosted(Lives):
         if host not in self.hosts.frozen:
             return False
         self.hosts.frozen.discard(host)
-        self._end_leases()
+        self.end_leases()
         return True
 
     def gap(self, consumer: str, provider: str, way: int, place: int) -> bool:
@@ -294,7 +294,8 @@ class Hosted(Lives):
             return epoch
         return epoch | self.hosts.taken[host_of(consumer), host_of(provider)].number << LEASE_BITS
 
-    def _end_leases(self) -> None:
+    def end_leases(self) -> None:
+        """Have each host that runs look whether a lease of it is over."""
         for (a, b), taken in self.hosts.taken.items():
             if a not in self.hosts.frozen and taken.lease.is_over(self.hosts.clock(a)):
                 self._end_taken(a, b)
