@@ -198,7 +198,7 @@ def _in_place(cls: type[SimRegistrar]) -> Callable[[Patch], type[SimRegistrar]]:
     return lambda patch: cls
 
 
-def _in_tables(patch: Patch, function: Any, by: Any) -> None:
+def in_tables(patch: Patch, function: Any, by: Any) -> None:
     """Have decide() call another function where its tables have this one."""
     found = 0
     for name in ("_MESSAGES", "_MESSAGES_OF_A_SENDER", "_COMMANDS"):
@@ -276,7 +276,7 @@ def no_stamp(patch: Patch) -> type[SimRegistrar]:
         parent = decision.catalog.resources.get(query.parent)
         return query if parent is None else _replace(query, attempt=parent.attempt)
 
-    _in_tables(patch, reconciliation.reconcile, _taking_back(stampless))
+    in_tables(patch, reconciliation.reconcile, _taking_back(stampless))
     return SimRegistrar
 
 
@@ -325,7 +325,7 @@ def acknowledges_at_once(patch: Patch) -> type[SimRegistrar]:
         if message.notice.id in decision.catalog.hearing:
             notices.acknowledge(decision, provider, message.notice.id)
 
-    _in_tables(patch, noticed, hasty)
+    in_tables(patch, noticed, hasty)
     return SimRegistrar
 
 
@@ -339,7 +339,7 @@ def hears_twice(patch: Patch) -> type[SimRegistrar]:
             del decision.catalog.heard[place]
         noticed(decision, provider, message)
 
-    _in_tables(patch, noticed, forgetful)
+    in_tables(patch, noticed, forgetful)
     return SimRegistrar
 
 
@@ -359,7 +359,7 @@ def no_queue(patch: Patch) -> type[SimRegistrar]:
         plain(decision, message)
         decision.catalog.unloading.update(unloading_now)
 
-    _in_tables(patch, plain, impatient)
+    in_tables(patch, plain, impatient)
     patch(recovery, "load", impatient)
     return SimRegistrar
 
@@ -376,7 +376,7 @@ def releases_later(patch: Patch) -> type[SimRegistrar]:
         decision.request(held.registrar, Unload(held.id, decision.catalog.name))
 
     original: Any = holding.release
-    _in_tables(patch, original, release)
+    in_tables(patch, original, release)
     return SimRegistrar
 
 
@@ -403,7 +403,7 @@ def takes_everything_back(patch: Patch) -> type[SimRegistrar]:
     def since_ever(_decision: Decision, query: FetchedQuery) -> FetchedQuery:
         return _replace(query, seq=0, response=query.response or b"")
 
-    _in_tables(patch, reconciliation.reconcile, _taking_back(since_ever))
+    in_tables(patch, reconciliation.reconcile, _taking_back(since_ever))
     return SimRegistrar
 
 
@@ -415,7 +415,7 @@ def starts_over(patch: Patch) -> type[SimRegistrar]:
 
 def waits_for_a_broken_line(patch: Patch) -> type[SimRegistrar]:
     """A load whose direct line broke is not asked for again."""
-    _in_tables(patch, holding.send_again, lambda decision, command: None)
+    in_tables(patch, holding.send_again, lambda decision, command: None)
     return SimRegistrar
 
 
@@ -582,7 +582,7 @@ def comes_back(patch: Patch) -> type[SimRegistrar]:
         return lambda decision, command: plain(decision, _replace(command, callback_of=""))
 
     for plain in (status_changes.set_status, status_changes.set_response):
-        _in_tables(patch, plain, of_nobody(plain))
+        in_tables(patch, plain, of_nobody(plain))
     return SimRegistrar
 
 
@@ -653,7 +653,7 @@ def forgets_who_was_away(patch: Patch) -> type[SimRegistrar]:
                 decision.drop(peer)
 
     original = reconciliation.end_closing
-    _in_tables(patch, original, end_closing)
+    in_tables(patch, original, end_closing)
     return SimRegistrar
 
 
@@ -670,7 +670,7 @@ def forgets_what_is_gone(patch: Patch) -> type[SimRegistrar]:
         original(decision, _replace(command, empty=command.final))
 
     original = reconciliation.peer_gone
-    _in_tables(patch, original, peer_gone)
+    in_tables(patch, original, peer_gone)
     return SimRegistrar
 
 
@@ -692,7 +692,7 @@ def writes_priorities_later(patch: Patch) -> type[SimRegistrar]:
         del decision.changes[count:]
 
     original = priorities.set_priority
-    _in_tables(patch, original, set_priority)
+    in_tables(patch, original, set_priority)
     return SimRegistrar
 
 
@@ -722,7 +722,7 @@ def compares_no_priorities(patch: Patch) -> type[SimRegistrar]:
 
 def believes_what_was_overtaken(patch: Patch) -> type[SimRegistrar]:
     """A priority that comes a second time, after a newer one, is left as it is."""
-    _in_tables(patch, priorities.reprioritised, lambda decision, message: None)
+    in_tables(patch, priorities.reprioritised, lambda decision, message: None)
     return SimRegistrar
 
 
@@ -759,7 +759,7 @@ def unloads_what_is_revoked(patch: Patch) -> type[SimRegistrar]:
         if resource is not None and resource.id in decision.catalog.revocations and resource.phase is Phase.LOADED:
             unloading.begin_unload(decision, resource)
 
-    _in_tables(patch, plain, revoke)
+    in_tables(patch, plain, revoke)
     return SimRegistrar
 
 

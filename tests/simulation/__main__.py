@@ -7,7 +7,7 @@ import random
 import sys
 import time
 
-from simulation.process_faults import EXCLUSIVE_FIRST
+from simulation.process_faults import EXCLUSIVE_FIRST, HOSTS_FIRST
 from simulation.runner import Outcome, report, run
 
 _EVERY_S = 2.0
@@ -21,7 +21,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--steps", type=int, default=400, help="steps of chance in each world (default: 400)")
     parser.add_argument("--seconds", type=float, default=60.0, help="without a number of runs: for how long")
     options = parser.parse_args(arguments)
-    fresh = random.SystemRandom().randrange(EXCLUSIVE_FIRST, 2 * EXCLUSIVE_FIRST)
+    fresh = random.SystemRandom().randrange(EXCLUSIVE_FIRST, 2 * HOSTS_FIRST)
     first: int = fresh if options.seed is None else options.seed
     broken = _run(first, options.runs, options.steps, options.seconds)
     if broken is None:

@@ -59,6 +59,11 @@ class SmallWorld(NamedTuple):
         hasty: registrars that decide everything as it comes in.
         linked: whether those who ask have links to their providers before they do.
         budget: what decides when a load of a share ends, and which shares are revoked.
+        rates: how fast the clock of each host goes, if the registrars are on hosts.
+        ticks: how often half the time of a lease passes, and a little more.
+        rounds: how often all gateways that reach each other renew their leases.
+        partings: how often a partition comes between the hosts. It may heal at any time.
+        stumbles: how often a gateway is killed.
     """
 
     layout: Mapping[str, tuple[Server, ...]]
@@ -72,6 +77,11 @@ class SmallWorld(NamedTuple):
     hasty: frozenset[str] = frozenset()
     linked: bool = False
     budget: Budget | None = None
+    rates: Mapping[str, float] | None = None
+    ticks: int = 0
+    rounds: int = 0
+    partings: int = 0
+    stumbles: int = 0
 
 
 class Walk(NamedTuple):
@@ -97,6 +107,10 @@ class _Spent(NamedTuple):
     cuts: int = 0
     raises: int = 0
     tires: int = 0
+    ticks: int = 0
+    rounds: int = 0
+    partings: int = 0
+    stumbles: int = 0
     book: Book = Book()
 
 
@@ -141,7 +155,7 @@ def walk(
 
 def begun(small: SmallWorld, factory: Factory) -> World:
     """Return the world before anybody has asked for anything: all registrars are up."""
-    world = World(dict(small.layout), factory, small.hasty)
+    world = World(dict(small.layout), factory, small.hasty, dict(small.rates or {}))
     for person in small.people if small.linked else ():
         world.registrars[person.registrar].want(person.provider)
     finish(world)
@@ -209,6 +223,8 @@ def _moves(world: World, small: SmallWorld, spent: _Spent) -> Iterator[tuple[Ste
     if small.budget is not None:
         for step, book in small.budget.moves(world, spent.book):
             yield step, spent._replace(book=book)
+    if small.rates is not None:
+        yield from _of_hosts(world, small, spent)
     for key in world.todo.keys:
         if small.budget is None or not small.budget.decides(key):
             yield from _goes_on(world, small, spent, key)
@@ -231,6 +247,33 @@ def _moves(world: World, small: SmallWorld, spent: _Spent) -> Iterator[tuple[Ste
             for provider, peering in registrar.clients.items():
                 if not peering.link.cut:
                     yield ("cut", name, provider, 0, 0), spent._replace(cuts=spent.cuts + 1)
+
+
+_TICK = 56
+"""Tenths of a second: a little more than half the time for which a provider keeps what it has heard nothing of."""
+
+
+def _of_hosts(world: World, small: SmallWorld, spent: _Spent) -> Iterator[tuple[Step, _Spent]]:
+    """Return what may happen to the hosts: time passes, leases are renewed or end, a partition comes or heals."""
+    hosts = world.hosts
+    if spent.ticks < small.ticks:
+        yield ("tick", _TICK), spent._replace(ticks=spent.ticks + 1)
+    if spent.rounds < small.rounds:
+        yield ("round",), spent._replace(rounds=spent.rounds + 1)
+    if world.apart:
+        yield ("heal",), spent
+    elif spent.partings < small.partings:
+        names = tuple(registrar.name for registrar in world.on(hosts.names[0]))
+        for how in ("hold", "cut"):
+            yield ("part", names, how), spent._replace(partings=spent.partings + 1)
+    for b, given in hosts.given.items():
+        for a, lease in given.items():
+            if lease.is_over(hosts.clock(b)):
+                yield ("lapse", b, a, 1), spent
+        if spent.stumbles < small.stumbles:
+            yield ("stumble", b), spent._replace(stumbles=spent.stumbles + 1)
+        if hosts.knows(b):
+            yield ("known", b), spent
 
 
 def _goes_on(world: World, small: SmallWorld, spent: _Spent, key: Key) -> Iterator[tuple[Step, _Spent]]:

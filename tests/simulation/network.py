@@ -80,7 +80,7 @@ class Network(WorldState):
         there.links[consumer] = link
         if old is not None:
             self._replace_link(consumer, provider, old)
-        here.linked(provider, link, there.epoch)
+        here.linked(provider, link, self.run_of(consumer, provider))
         self.todo.discard(key)  # what was decided meanwhile has found no link yet: this one is for it, too
         return True
 

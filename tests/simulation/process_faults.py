@@ -41,7 +41,9 @@ IDLE_FIRST = 2**52
 RELOAD_FIRST = 2**53
 """From here on, owners reload resources."""
 EXCLUSIVE_FIRST = 2**54
-"""From here on, some servers are exclusive, and some loads wait in line only for a while; fresh seeds are from here."""
+"""From here on, some servers are exclusive, and some loads wait in line only for a while."""
+HOSTS_FIRST = 2**55
+"""From here on, the registrars are on two or three hosts; fresh seeds are from 2**54 to 2**56."""
 PRIORITIES = (STANDBY, -3, 0, 0, 4, 9)
 STATES = ("OK", "UPDATE", "WARNING", "ERROR", "FATAL")
 

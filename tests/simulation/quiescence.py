@@ -26,6 +26,7 @@ _WAITS_FOREVER = frozenset(("tire", "late", "timer"))
 def come_to_rest(world: World) -> None:
     """Mend everything, finish all work, check; connect anew and check again; let everything go and check that."""
     world.heal()
+    world.mend_hosts()
     for registrar in world.live():
         world.space(registrar.name)
         if registrar.state not in ("away", "absent"):
@@ -112,6 +113,8 @@ def _can(world: World, key: Key) -> bool:
             final = key[2] not in here.gone and world.unreachable(key[2], asked=False) is not None
             return final or key[2] in here.asked or here.catalog.waits_for(key[2])
         return there.state in ("up", "gone") or (there.state == "starting" and key[1] == key[2])
+    if key[0] == "fence":
+        return world.registrars[key[1]].state == "up"
     if key[0] == "reregister":
         return key[2] not in world.registrars[key[1]].catalog.servers
     return True
@@ -409,6 +412,7 @@ def _check_answers(world: World) -> None:
             query_id in ledger.losses | ledger.revoked | (ledger.evicted & ledger.forgotten)
             or ledger.provider[query_id] in world.retired
             or (query_id in ledger.forgotten and ledger.provider[query_id] in world.left)
+            or (query_id in ledger.forgotten and query_id in world.hosts.lapsed)
         )
         if holder is None and not gone and world.asker[query_id] not in world.retired:
             raise Violation("acknowledged", f"{query_id}: its load was acknowledged, and it is held no more")

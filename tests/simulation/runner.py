@@ -28,7 +28,7 @@ def run(seed: int, steps: int = 400, factory: Factory = SimRegistrar) -> Outcome
     chance = Chance(seed)
     history: list[Step] = []
     try:
-        world = World(chance.layout, factory, chance.hasty)
+        world = World(chance.layout, factory, chance.hasty, chance.rates)
         for _ in range(steps):
             step = chance.next(world)
             if step is not None:
@@ -45,7 +45,7 @@ def replay(seed: int, history: Sequence[Step], factory: Factory = SimRegistrar, 
     world: World | None = None
     try:
         chance = Chance(seed)
-        world = World(chance.layout, factory, chance.hasty)
+        world = World(chance.layout, factory, chance.hasty, chance.rates)
         world.trace = trace
         for step in history:
             world.apply(step)

@@ -7,8 +7,9 @@ import random
 from msgspec.structs import replace
 
 from rr_actors.registrar.model.catalog import Server
+from simulation.host_faults import HostChance, on_hosts
 from simulation.pending_steps import Key
-from simulation.process_faults import EXCLUSIVE_FIRST, FIRST, HASTY_FIRST, IDLE_FIRST, Rough
+from simulation.process_faults import EXCLUSIVE_FIRST, FIRST, HASTY_FIRST, HOSTS_FIRST, IDLE_FIRST, Rough
 from simulation.world import Step, World
 
 REQUESTS = (b"p", b"q")
@@ -62,6 +63,11 @@ class Chance:
         if seed >= EXCLUSIVE_FIRST:
             self._waits = random.Random(f"exclusive {seed}")
             self.layout = _with_exclusive(self._waits, self.layout)
+        self.rates: dict[str, float] = {}
+        self._hosts: HostChance | None = None
+        if seed >= HOSTS_FIRST:
+            self.layout, self.rates = on_hosts(random.Random(f"hosts {seed}"), self.layout)
+            self._hosts = HostChance(seed, list(self.rates))
         self.names = list(self.layout)
         self.providers = [name for name, servers in self.layout.items() if servers]
         draw = self.rng.random
@@ -98,6 +104,8 @@ class Chance:
 
     def next(self, world: World) -> Step | None:
         """What happens next; None: nothing comes to mind."""
+        if self._hosts is not None and (step := self._hosts.next(world)) is not None:
+            return step
         if self.rough is not None and (trouble := self.rough.next(world)) is not None:
             return trouble
         draw = self.rng.random()

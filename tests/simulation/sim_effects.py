@@ -13,7 +13,7 @@ from rr_actors.registrar.core.status_changes import is_busy
 from rr_actors.registrar.core.status_delivery import is_listened
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import effects as e
-from rr_actors.registrar.model.messages import Loaded
+from rr_actors.registrar.model.messages import Loaded, Released
 from rr_actors.registrar.model.rows import is_own, is_revocation
 from simulation.oracle import Violation
 from simulation.sim_links import TO_CONSUMER, TO_PROVIDER
@@ -25,6 +25,9 @@ def _reply(shell: SimShell, effect: e.SendReply) -> None:
     message: Any = effect.message
     if type(message) is Loaded and message.query_id not in shell.world.ledger.stored:
         raise Violation("acknowledged", f"{message.query_id}: answered as loaded, and it is not on disk")
+    if type(message) is Released:
+        shell.world.released(shell.name, message.number)
+        return
     line, by_link = shell.routes.way_of(message)
     if line is not None:
         shell.answer(line, message)

@@ -13,7 +13,7 @@ from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import digests
 from rr_actors.registrar.model.catalog import Catalog, Server, Unsaved
 from rr_actors.registrar.model.effects import Effect
-from rr_actors.registrar.model.messages import Fetch, Fetched, Gone, Load, Loaded, Message, Noticed, Unload
+from rr_actors.registrar.model.messages import Fetch, Fetched, Gone, Leased, Load, Loaded, Message, Noticed, Unload
 from rr_actors.registrar.model.rows import HIGHEST, Content, Held, Hold, Notice, Phase, Resource, State, content_of
 from simulation.oracle import Ledger, Violation
 from simulation.pending_steps import Todo
@@ -67,6 +67,18 @@ class Surroundings(Protocol):
 
     def dependent(self) -> dict[str, int]:
         """Return the resources that are loaded and have not dealt with a status, and the attempts of their loads."""
+        ...
+
+    def run_of(self, consumer: str, provider: str) -> int:
+        """Return the epoch of a provider as a consumer knows it."""
+        ...
+
+    def close_fenced(self, provider: str, leased: list[str]) -> None:
+        """Have a provider close the links and lines of hosts without a lease."""
+        ...
+
+    def released(self, provider: str, number: int) -> None:
+        """Have a gateway hear that a registrar has released what hosts without a lease held."""
         ...
 
     def unload_ended(self, registrar: SimShell, query_id: str, failure: Failure | None) -> None:
@@ -175,6 +187,8 @@ class SimShell:
             return
         if type(message) is Gone:
             self.world.expel(self.name, message.origin)
+        elif type(message) is Leased:
+            self.world.close_fenced(self.name, message.hosts)
         self.put(message, sender)
 
     def next_seq(self) -> int:
@@ -255,7 +269,7 @@ class SimShell:
     def reaches(self, provider: SimShell) -> bool:
         """Whether threads may take direct lines to it."""
         up = self.catalog.up.get(provider.name, 0)
-        return provider.state == "up" and self.epochs.get(up) == provider.epoch
+        return provider.state == "up" and self.epochs.get(up) == self.world.run_of(self.name, provider.name)
 
     def want(self, provider: str) -> None:
         """Have a link made."""

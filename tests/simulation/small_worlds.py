@@ -46,6 +46,18 @@ _SHARES = SmallWorld(
 """Three shares of two, where there is room for two. The lamp and the fan are not needed later, the pump is."""
 _HOUSE = {"a": (), "house": (Server("device"),), "budgets": (Server("share"),)}
 _DEVICES = tuple(each._replace(provider="house", server="device") for each in (_LAMP, _PUMP))
+_HOSTS = SmallWorld(
+    {"h0/a": (), "h1/r": (Server("part"),)},
+    {},
+    (Person("h0/a", "h1/r", "part"),),
+    hasty=frozenset(("h0/a", "h1/r")),
+    linked=True,
+    rates={"h0": 0.96, "h1": 1.04},
+    ticks=3,
+    rounds=1,
+    partings=1,
+)
+"""Two hosts, one lease, and one resource, which a consumer of the other host holds."""
 _DIRECT = tuple(each._replace(then=("owe",), direct=True) for each in _BOTH)
 
 WORLDS = {
@@ -98,6 +110,10 @@ WORLDS = {
         budget=Budget(2.0),
         hasty=frozenset(_HOUSE),
     ),
+    "lease": _HOSTS,
+    "lease and direct lines": _HOSTS._replace(people=(Person("h0/a", "h1/r", "part", ("owe",), direct=True),)),
+    "lease and crash": _HOSTS._replace(crashes=1),
+    "lease and killed gateway": _HOSTS._replace(stumbles=1),
     "crash with two holders": _TWO._replace(
         people=(Person("a", "r", "part"), Person("b", "r", "part")), parts={}, crashes=1, linked=True
     ),

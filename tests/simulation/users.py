@@ -53,7 +53,7 @@ class People(Trouble):
         if load is None:
             return False
         line = self.lines[ask.query_id] = SimLine(ask.query_id, registrar.name, ask.registrar, registrar.epoch)
-        line.run = self.registrars[ask.registrar].epoch
+        line.run = self.run_of(registrar.name, ask.registrar)
         line.ways[TO_PROVIDER].append(load)
         self.todo.add(("line", ask.query_id, TO_PROVIDER))
         return True

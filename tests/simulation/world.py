@@ -12,7 +12,7 @@ from typing import Any
 from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.rows import Hold, State, is_revocation
-from simulation.lives import Lives
+from simulation.hosts import Hosted
 from simulation.sim_process import Run, SimShell
 from simulation.sim_registrar import Killed, SimRegistrar
 
@@ -22,11 +22,13 @@ RAISED = Failure("LoadFailed", "the callback raised")
 STUCK = Failure("UnloadFailed", "the callback raised")
 
 
-class World(Lives):
+class World(Hosted):
     """Everything of one simulated run. Steps, besides those of the classes above: wake, save, register, timer, call."""
 
     def apply(self, step: Step) -> bool:
         """Perform a step; False: it cannot happen in this world now."""
+        if self.stands_still(step):
+            return False
         perform = _PERFORM[step[0]]
         if self.trace is not None:
             self.trace.append(describe(step))
@@ -197,6 +199,7 @@ _STEPS = (
     *("wake", "act", "net", "dial", "save", "register", "serve", "up", "timer", "call", "load", "line", "tire", "rank"),
     *("unload", "join", "owe", "late", "own", "reregister", "crash", "retire", "cut", "snap", "part", "heal"),
     *("dup", "full", "space", "listen", "close", "closing", "delete", "generation"),
+    *("tick", "round", "meet", "beat", "beaten", "lapse", "known", "fence", "freeze", "thaw", "stumble", "gap"),
 )
 _PERFORM: dict[str, Any] = {name: getattr(World, name) for name in _STEPS}
 

@@ -20,10 +20,15 @@ class WorldState:
         layout: the servers of each registrar, by its name.
         factory: makes a registrar; tests put broken ones in.
         hasty: registrars that decide everything as it comes in; the others when they are woken.
+        rates: how fast the clock of each host goes, if there are hosts.
     """
 
     def __init__(
-        self, layout: dict[str, tuple[Server, ...]], factory: Any = SimRegistrar, hasty: frozenset[str] = frozenset()
+        self,
+        layout: dict[str, tuple[Server, ...]],
+        factory: Any = SimRegistrar,
+        hasty: frozenset[str] = frozenset(),
+        rates: dict[str, float] | None = None,
     ) -> None:
         self.layout = layout
         self.hasty = hasty
@@ -45,8 +50,17 @@ class WorldState:
         self.registrars: dict[str, SimRegistrar] = {
             name: factory(self, name, servers) for name, servers in layout.items()
         }
+        self.begin_hosts(rates or {})
         for registrar in self.registrars.values():
             registrar.start()
+
+    def begin_hosts(self, rates: dict[str, float]) -> None:
+        """Give each host its gateway."""
+        raise AssertionError(rates)
+
+    def run_of(self, consumer: str, provider: str) -> int:
+        """Return the epoch of a provider as a consumer knows it."""
+        raise AssertionError(consumer, provider)
 
     def wake(self, name: str, count: int = 1_000_000, fault: str = "", effects: int = 0) -> bool:
         """A registrar handles what came in."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -198,6 +199,23 @@ def test_a_system_that_is_back_within_its_lease_holds_what_it_held(tmp_path: Pat
             assert held in [query.resource_id for query in app.queries()]
             app.unload_all(timeout_s=LIMIT_S)
         assert holders(b) == []
+
+
+def test_a_host_that_is_back_with_an_empty_state_directory_leaves_nothing_held(tmp_path: Path) -> None:
+    listen = endpoint()
+    with cameras_at(tmp_path / "b", listen) as b:
+        command = [sys.executable, "-c", CONSUMER, tmp_path / "a", listen]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=ENVIRONMENT) as other:
+            try:
+                assert other.stdout is not None
+                assert other.stdout.readline() == b"loaded\n"
+            finally:
+                other.kill()
+        shutil.rmtree(tmp_path / "a")
+        with consumer_at(tmp_path / "a", listen) as a:
+            app = a.open_registrar("another")
+            with app.load("hostb/cameras/camera", "front", timeout_s=LIMIT_S):
+                assert holders(b) == ["hosta/another"]
 
 
 CLIENT = CONSUMER.replace("system.open_registrar", "rr.connect(sys.argv[1]).open_registrar")

@@ -15,7 +15,6 @@ from rr_actors.base.values.failure import Failure
 from rr_actors.registrar.core import (
     callback_runs,
     holding,
-    leases,
     notices,
     priorities,
     reconciliation,
@@ -112,7 +111,7 @@ _MESSAGES_OF_A_SENDER: dict[type[Any], Callable[[Decision, str, Any], None]] = {
     m.Unloaded: holding.unloaded,
     m.Noticed: status_delivery.noticed,
     m.Describe: _describe,
-    m.Leased: leases.leased,
+    m.Leased: reconciliation.leased,
 }
 """The messages that do not name their sender, and whose function needs it."""
 
@@ -172,7 +171,7 @@ _COMMANDS: dict[type[c.Command], Callable[[Decision, Any], None]] = {
     c.ConsumerLost: reconciliation.consumer_lost,
     c.LinkLost: reconciliation.link_lost,
     c.PeerGone: reconciliation.peer_gone,
-    c.LeaseOver: leases.lease_over,
+    c.LeaseOver: reconciliation.lease_over,
 }
 
 

@@ -1,7 +1,12 @@
-"""The decisions of consumer and provider when the link between them opens and breaks."""
+"""The decisions of consumer and provider when the link between them opens and breaks, and when a lease is over.
+
+A lease is between two hosts (docs/decisions/0110-leases-between-hosts.md). Both sides decide for themselves: the
+registrars of the consumer's host have taken what they hold as lost, before the provider's host releases it.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from itertools import groupby
 from operator import attrgetter
 
@@ -14,11 +19,20 @@ from rr_actors.registrar.core.loads.loading import is_to_run
 from rr_actors.registrar.core.notices import drop_notice, drop_parked, send_notices_to
 from rr_actors.registrar.core.priorities import follow, tell, tell_unsent
 from rr_actors.registrar.core.releasing import add_all_in_flight, look_there, provider_lost, released
+from rr_actors.registrar.core.unloading import gone
 from rr_actors.registrar.model import digests
 from rr_actors.registrar.model.catalog import Decision
-from rr_actors.registrar.model.commands import BeginClosing, ConsumerLost, EndClosing, LinkLost, PeerGone, Reconcile
+from rr_actors.registrar.model.commands import (
+    BeginClosing,
+    ConsumerLost,
+    EndClosing,
+    LeaseOver,
+    LinkLost,
+    PeerGone,
+    Reconcile,
+)
 from rr_actors.registrar.model.effects import Connect, LoadResolved, SendReply, SendRequest, UnloadResolved
-from rr_actors.registrar.model.messages import Fetch, Fetched, FetchedQuery, Loaded, Unload
+from rr_actors.registrar.model.messages import Fetch, Fetched, FetchedQuery, Gone, Leased, Loaded, Released, Unload
 from rr_actors.registrar.model.rows import Held, Hold, State
 from rr_actors.registrar.model.store import is_needed
 
@@ -193,6 +207,24 @@ def peer_gone(decision: Decision, command: PeerGone) -> None:
         decision.drop(catalog.peers[provider])
 
 
+def lease_over(decision: Decision, command: LeaseOver) -> None:
+    """Lose all that is held at a provider of another host. It may still have that: the releases are owed.
+
+    Loads that wait go on waiting: the next link asks for them again. An answer of the lease that is over may still be
+    on its way to a thread; got() passes it over.
+    """
+    catalog, provider = decision.catalog, command.registrar
+    add_all_in_flight(decision, provider)
+    decision.note(catalog.lapsed, provider, command.run)
+    for id in list(catalog.outbound.get(provider, ())):
+        held = catalog.held[id]
+        decision.forget(catalog.fresh, id)
+        if held.hold is Hold.HELD and id not in catalog.ending:
+            decision.note(catalog.doubted, id, True)
+            lose(decision, held, command.event, command.why)
+    decision.cause(Connect(provider))
+
+
 def begin_closing(decision: Decision, command: BeginClosing) -> None:
     """Load nothing from now on: who would release it?"""
     decision.note(decision.catalog.shut, command.own, command.failure)
@@ -270,3 +302,19 @@ def fetch(decision: Decision, message: Fetch) -> None:
 def consumer_lost(decision: Decision, command: ConsumerLost) -> None:
     """Note that a consumer's link is down: its notices wait for a new link, and its queries stay."""
     decision.forget(decision.catalog.consumers, command.origin)
+
+
+def is_fenced(origin: str, leased: Collection[str]) -> bool:
+    """Return whether a consumer is of another host, which has no lease."""
+    host, slash, _ = origin.partition("/")
+    return bool(slash) and host not in leased
+
+
+def leased(decision: Decision, sender: str, message: Leased) -> None:
+    """Release what registrars of hosts without a lease hold, and say that this is on disk."""
+    catalog = decision.catalog
+    parked = [one.origin for waiting in catalog.recovering.values() for one in waiting]
+    for origin in dict.fromkeys([*catalog.by_origin, *catalog.notices_to, *parked]):
+        if is_fenced(origin, message.hosts):
+            gone(decision, Gone(origin))
+    decision.cause(SendReply(sender, Released(message.number)))

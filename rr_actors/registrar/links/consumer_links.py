@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from rr_actors.actors.turns import may_be_interrupted
 from rr_actors.base.errors import NotSerializable, RrError, Unavailable, shown
 from rr_actors.base.reporting.log import Log
-from rr_actors.registrar.core.leases import is_fenced
+from rr_actors.registrar.core.reconciliation import is_fenced
 from rr_actors.registrar.engine.registrar_base import RegistrarBase
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.messages import (

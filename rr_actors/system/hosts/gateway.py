@@ -45,7 +45,7 @@ from rr_actors.system.hosts.link_relay import Relay
 from rr_actors.system.registrar_lookup import catalogs_on_disk, give_up_connected
 from rr_actors.wire.hosts.host_link import HostLink
 from rr_actors.wire.hosts.host_names import REFUSED, UNREACHABLE, UP, HostRow, away, not_exported, put_row, row_of
-from rr_actors.wire.hosts.lease_rows import LeaseRow, boot_id, now_s, read_lease, write_lease
+from rr_actors.wire.hosts.lease_rows import LeaseRow, boot_id, identity, now_s, read_lease, write_lease
 from rr_actors.wire.hosts.leases import BEATS, GivenLease, TakenLease, kept_s
 from rr_actors.wire.name_service import OtherHosts, Presence, registrar_key
 from rr_actors.wire.transport import Attach, Hello, Link, Receiver, Welcome
@@ -148,7 +148,9 @@ class _Run:
         self._peers: dict[str, _Peer] = {}
         self._told: dict[Link, str] = {}  # the links by which other hosts hear what is exported
         self._relays: dict[Relay, tuple[str, bool]] = {}  # the other host of each, and whether it serves that host
+        self._identity = identity(node.info.state_dir)
         self._given: dict[str, GivenLease] = {}
+        self._releases = any(export.on_lost == "release" for export in hosts.exports.values())
         self._known_from = now_s() + kept_s(hosts.lease_s)  # then all that were away for that long are without a lease
         self._told_known = False
         self._ticking: asyncio.Task[None] | None = None
@@ -254,7 +256,7 @@ class _Run:
         while peer.places and not self._closing:
             hearing = _Hearing(functools.partial(self._said, peer))
             try:
-                hello = Hello(_HOSTS, peer.name, self._name, 0)
+                hello = Hello(_HOSTS, peer.name, self._name, self._identity)
                 peer.link = await self._network.connect(peer.name, hello, hearing.attach)
                 peer.next_beat = 0.0
             except ProtocolMismatch as error:
@@ -507,9 +509,13 @@ class _Run:
         return Welcome(self._exported.check(hello.to, host).epoch), functools.partial(self._attach_host, host)
 
     def _attach_gateway(self, link: Link) -> Receiver:
-        host = self._told[link] = _sender(link)
-        given = self._given.setdefault(host, GivenLease(now_s(), self._hosts.lease_s))
-        given.hear(now_s())
+        host, now, who = _sender(link), now_s(), link.hello.epoch
+        given = self._given.setdefault(host, GivenLease(now, self._hosts.lease_s, who))
+        if given.identity != who and self._releases:
+            text = f"another system of the name {host!r} has a lease at {self._name!r}: its end has to come first"
+            raise NameTaken(f"{text}, {self._hosts.lease_s:g} s after it was heard", name=host)
+        self._told[link] = host
+        given.hear(now)
         if self._exported is not None:
             link.send_now(self._exports_for(host))
 

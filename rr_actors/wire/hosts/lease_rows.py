@@ -9,12 +9,14 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
+import random
 import time
 from pathlib import Path
 
 import msgspec
 
 _FOLDER = ".leases"
+_IDENTITY = ".identity"  # no host has such a name
 
 
 class LeaseRow(msgspec.Struct, frozen=True):
@@ -56,6 +58,24 @@ def read_lease(state_dir: str, host: str) -> LeaseRow | None:
     with contextlib.suppress(OSError, msgspec.MsgspecError):
         return _decode(Path(state_dir, _FOLDER, host).read_bytes())
     return None
+
+
+def identity(state_dir: str) -> int:
+    """Return a number that differs between state directories: one that is new knows nothing of what is held elsewhere.
+
+    Raises:
+        OSError: it cannot be written, for instance as the disk is full.
+    """
+    folder = Path(state_dir, _FOLDER)
+    folder.mkdir(mode=0o700, exist_ok=True)
+    place = folder / _IDENTITY
+    with contextlib.suppress(OSError, ValueError):
+        return int(place.read_text(encoding="ascii"))
+    number = random.SystemRandom().randrange(1, 1 << 62)
+    draft = folder / f"{_IDENTITY}.new"
+    draft.write_text(str(number), encoding="ascii")
+    os.replace(draft, place)
+    return number
 
 
 def write_lease(state_dir: str, host: str, row: LeaseRow) -> None:

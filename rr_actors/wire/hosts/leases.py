@@ -56,9 +56,14 @@ class TakenLease:
 
 
 class GivenLease:
-    """The provider's side of a lease, which begins now."""
+    """The provider's side of a lease, which begins now.
 
-    def __init__(self, now: float, lease_s: float) -> None:
+    Args:
+        identity: of the system that has it; another one of the same name has no part in it.
+    """
+
+    def __init__(self, now: float, lease_s: float, identity: int = 0) -> None:
+        self.identity = identity
         self._heard = now
         self._lease_s = lease_s
 
