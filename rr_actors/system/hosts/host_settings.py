@@ -56,8 +56,8 @@ class Hosts:
         routes: the registrars here for which another host's are meant, as {"maps": "hostb/maps"}: then
             load("maps/map") loads from there. Default: {}, none. Name one when a manager moves to another host.
         lease_s: for so many seconds after it was last heard another host has what it holds here, 1 to 3600. It tries to
-            reach this one again for as long (docs/hosts.md). Default: 10. A longer one outlasts longer outages; a
-            shorter one gives sooner to others what Export(on_lost="release") says.
+            reach this one again for as long (docs/hosts.md). Default: 10.0. Set a longer one to outlast longer outages,
+            and a shorter one to give sooner to others what Export(on_lost="release") says.
         group: hosts of one group see each other. Default: "rr". Set another for a second group on the same network.
 
     Raises:
