@@ -197,7 +197,7 @@ class Programs(Manager):
             raise NotFound(text, id=program, known=known)
         return list(self._external.last_output(program, max(1, lines)))
 
-    @server("program", idle="pause", health=Health())  # each as its request and its manager say: see _adapted()
+    @server("program", idle="pause", health=Health())  # each as its request and its manager say: see _rr_adapted()
     def run_program(self, request: RunProgram) -> Program:
         """Start a program, or adopt one that an interrupted load has started."""
         me = current()

@@ -57,8 +57,8 @@ class WatchedManager(Manager):
 
     _watch: ClassVar[Watch]
 
-    def _adapted(self, spec: ServerSpec) -> ServerSpec:
-        return _watcher(self._watch).watched(super()._adapted(spec))
+    def _rr_adapted(self, spec: ServerSpec) -> ServerSpec:
+        return _watcher(self._watch).watched(super()._rr_adapted(spec))
 
 
 def watched_class(cls: type[Manager], watch: Watch) -> type[Manager]:

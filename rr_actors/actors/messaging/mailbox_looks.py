@@ -155,7 +155,7 @@ def _steppable(ref: pykka.ActorRef[Any]) -> SteppedMailbox:
     mailbox = ref.actor_inbox
     if isinstance(mailbox, SteppedMailbox):
         return mailbox
-    if getattr(ref.actor_class, "_lives_on_loop", False):
+    if getattr(ref.actor_class, "_rr_lives_on_loop", False):
         text = "it is an actor of the framework, which other actors need; only your actors and managers can be paused"
         raise UsageError(f"{ref}: {text}")
     start = "start it with System(debug=True), or rr-actors run --debug"
