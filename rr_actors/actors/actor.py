@@ -71,31 +71,35 @@ def is_frozen(cls: type) -> bool:
 
 
 class BaseActor(pykka.Actor):
-    """The base of both actor types: life, mailbox, exit report. Pykka documents how actors behave."""
+    """The base of both actor types: life, mailbox, exit report. Pykka documents how actors behave.
+
+    Its private names, and those of Manager, begin with `_rr_`: a user's class has names such as `_target` and `_handle`
+    of its own.
+    """
 
     mailbox_limit: ClassVar[int] = MAILBOX_LIMIT
     """How many messages may wait; the sender of one more gets MailboxFull. Default: 100,000. Lower it, in the class, to
     hear earlier that the actor is too slow."""
 
-    _lives_on_loop: ClassVar[bool] = False
+    _rr_lives_on_loop: ClassVar[bool] = False
     """Whether its handlers run on the framework's loop, and not in worker threads."""
 
-    _on_exit: OnExit | None
+    _rr_on_exit: OnExit | None
     """Called on the loop, once, when the actor has ended. Not if it never started: the call that starts it raises."""
 
-    _place: Any
-    _target: Target
-    _mailbox: Mailbox
-    _dispatcher: Dispatcher
-    _life_driver: Driver
-    _started: Reply[Any]
-    _begun = False
-    _handled: PykkaEnvelope[Any] | None = None  # while a handler runs, for those that look
-    _handled_at = 0.0  # since when, by time.monotonic()
-    _report = ExitReport("normal")
-    _final = False
-    _stop_replies: list[pykka.Future[Any]]
-    _monitors: set[Monitor]  # the monitors that this actor has set
+    _rr_place: Any
+    _rr_target: Target
+    _rr_mailbox: Mailbox
+    _rr_dispatcher: Dispatcher
+    _rr_life_driver: Driver
+    _rr_started: Reply[Any]
+    _rr_begun = False
+    _rr_handled: PykkaEnvelope[Any] | None = None  # while a handler runs, for those that look
+    _rr_handled_at = 0.0  # since when, by time.monotonic()
+    _rr_report = ExitReport("normal")
+    _rr_final = False
+    _rr_stop_replies: list[pykka.Future[Any]]
+    _rr_monitors: set[Monitor]  # the monitors that this actor has set
 
     def __new__(cls, *_args: Any, **_kwargs: Any) -> Self:
         # In __new__, and not in __init__: so a subclass's __init__ need not call this one.
@@ -104,17 +108,17 @@ class BaseActor(pykka.Actor):
         self = super().__new__(cls)
         birth = exit_reports.take()
         self.actor_urn = uuid.uuid4().urn if birth.path is None else urn_of_path(birth.path)
-        self._place = birth.place
-        self._on_exit = birth.on_exit
-        self._target = Target(self.actor_urn, birth.path or f"{cls.__name__} ({self.actor_urn})")
-        box = SteppedMailbox if not cls._lives_on_loop and is_debugged(birth.path) else Mailbox
-        self._mailbox = box(self._target.name, cls.mailbox_limit, opens_packed=not cls._lives_on_loop)
-        self.actor_inbox = self._mailbox
+        self._rr_place = birth.place
+        self._rr_on_exit = birth.on_exit
+        self._rr_target = Target(self.actor_urn, birth.path or f"{cls.__name__} ({self.actor_urn})")
+        box = SteppedMailbox if not cls._rr_lives_on_loop and is_debugged(birth.path) else Mailbox
+        self._rr_mailbox = box(self._rr_target.name, cls.mailbox_limit, opens_packed=not cls._rr_lives_on_loop)
+        self.actor_inbox = self._rr_mailbox
         self.actor_stopped = threading.Event()
-        self._actor_ref = ActorRef(self, self._target, birth.path)
-        self._started = Reply(self._target)
-        self._stop_replies = []
-        self._monitors = set()
+        self._actor_ref = ActorRef(self, self._rr_target, birth.path)
+        self._rr_started = Reply(self._rr_target)
+        self._rr_stop_replies = []
+        self._rr_monitors = set()
         return self
 
     def __init__(self, *_args: Any, **_kwargs: Any) -> None:
@@ -135,7 +139,7 @@ class BaseActor(pykka.Actor):
         check_may_block(f"{cls.__name__}.start()")
         actor = cls(*args, **kwargs)
         actor._start_actor_loop()
-        actor._started.get()
+        actor._rr_started.get()
         return actor.actor_ref
 
     @classmethod
@@ -154,7 +158,7 @@ class BaseActor(pykka.Actor):
 
         Args:
             path: the actor's path in its tree; its URN follows from it and stays the same after a restart.
-            place: handed to the hook _before_start.
+            place: handed to the hook _rr_before_start.
             on_exit: called on the loop, once, when the actor has ended.
 
         Raises:
@@ -163,7 +167,7 @@ class BaseActor(pykka.Actor):
         dispatcher = acquire()
         try:
             birth = exit_reports.Birth(path, place, on_exit)
-            if cls._lives_on_loop:
+            if cls._rr_lives_on_loop:
                 actor = Context().run(birth.of, cls, args, kwargs or {})
             else:
                 actor = await dispatcher.workers.run(birth.of, cls, args, kwargs or {})
@@ -171,9 +175,9 @@ class BaseActor(pykka.Actor):
         finally:
             release()
         try:
-            answer = await actor._started
+            answer = await actor._rr_started
         except asyncio.CancelledError:
-            actor._on_exit = None
+            actor._rr_on_exit = None
             actor.actor_ref.stop(block=False, reason="shutdown")
             raise
         return IGNORE if answer is IGNORE else actor.actor_ref
@@ -202,31 +206,31 @@ class BaseActor(pykka.Actor):
         Args:
             ref: a reference or proxy, or a SupervisorRef, to an actor in any process of the system.
         """
-        mailbox, name = self._mailbox, self._target.name  # not self: a monitor does not keep its actor
+        mailbox, name = self._rr_mailbox, self._rr_target.name  # not self: a monitor does not keep its actor
 
         def deliver(monitor: Monitor, down: Down) -> None:
             stamp = notes.down(name, str(down.ref), down.reason) if notes.watched.level[0] > 1 else None
             mailbox.put(DownNotice(down, monitor, stamp))
 
-        made = Monitor(ref, deliver, self._monitors.discard)
-        self._monitors.add(made)  # first: its Down removes it
+        made = Monitor(ref, deliver, self._rr_monitors.discard)
+        self._rr_monitors.add(made)  # first: its Down removes it
         begin(made)
         return made
 
     def stop(self, reason: Literal["normal", "shutdown"] = "normal") -> None:
         """Stop this actor when it has handled the waiting messages; with "shutdown", before it handles them."""
-        self._mailbox.put(Envelope(StopActor(reason)))
+        self._rr_mailbox.put(Envelope(StopActor(reason)))
 
     # -- hooks for hosts: a subclass overrides them to do more than the user's on_start and on_stop --------------------
 
-    async def _before_start(self, place: Any) -> None:
+    async def _rr_before_start(self, place: Any) -> None:
         """Prepare the start, on the loop, before on_start."""
 
-    async def _after_start(self) -> None:
+    async def _rr_after_start(self) -> None:
         """Complete the start, on the loop, when on_start has succeeded; the creator gets the reference after this."""
 
-    async def _after_stop(self, final: bool) -> None:
-        """Clean up, on the loop, after on_stop or on_failure, if _before_start succeeded. `final`: no restart."""
+    async def _rr_after_stop(self, final: bool) -> None:
+        """Clean up, on the loop, after on_stop or on_failure, if _rr_before_start succeeded. `final`: no restart."""
 
     # -- methods that Pykka calls --------------------------------------------------------------------------------------
 
@@ -248,120 +252,120 @@ class BaseActor(pykka.Actor):
         return cast("ActorRef[Self]", self._actor_ref)
 
     def _start_actor_loop(self) -> None:  # Pykka's name
-        shielded(self._enter_life)
+        shielded(self._rr_enter_life)
 
-    def _enter_life(self) -> None:
-        self._dispatcher = acquire()  # released when the actor has ended
-        self._life_driver = Driver(
-            self._dispatcher, self._live(), self._mailbox, self._target.name, on_loop=self._lives_on_loop
+    def _rr_enter_life(self) -> None:
+        self._rr_dispatcher = acquire()  # released when the actor has ended
+        self._rr_life_driver = Driver(
+            self._rr_dispatcher, self._rr_live(), self._rr_mailbox, self._rr_target.name, on_loop=self._rr_lives_on_loop
         )
-        self._mailbox.begin(self._life_driver.schedule)
+        self._rr_mailbox.begin(self._rr_life_driver.schedule)
         death_watch.begin(self.actor_stopped)
         running[self.actor_urn] = self.actor_ref  # this reference keeps the actor alive while it has no thread
         if self.actor_ref.path is None:  # ActorRegistry.stop_all() must not stop a supervised actor
             ActorRegistry.register(self.actor_ref)
         try:
-            self._life_driver.start()
+            self._rr_life_driver.start()
         except BaseException:
-            self._life_driver.close()
-            self._vanish()
-            refuse_all(self._mailbox.close(), self._target.name)
-            death_watch.ended(self.actor_stopped, self._report)
+            self._rr_life_driver.close()
+            self._rr_vanish()
+            refuse_all(self._rr_mailbox.close(), self._rr_target.name)
+            death_watch.ended(self.actor_stopped, self._rr_report)
             release()
             raise
 
-    async def _live(self) -> None:
+    async def _rr_live(self) -> None:
         envelope: PykkaEnvelope[Any] | None = None
         try:
-            self._handled, self._handled_at = Envelope(Starting()), monotonic()
-            if not await self._begin():
+            self._rr_handled, self._rr_handled_at = Envelope(Starting()), monotonic()
+            if not await self._rr_begin():
                 return
             handled = 0
             while not self.actor_stopped.is_set():
-                self._handled = envelope = self._mailbox.next()
+                self._rr_handled = envelope = self._rr_mailbox.next()
                 if envelope is None:
                     handled = 0
                     await REST
                     continue
-                self._handled_at = monotonic()
-                await self._handle(envelope)
+                self._rr_handled_at = monotonic()
+                await self._rr_handle(envelope)
                 handled += 1
                 if handled == BATCH:
                     handled = 0
-                    self._handled = None
+                    self._rr_handled = None
                     await PAUSE
         except GeneratorExit:  # the life is dropped, with its process
             raise
         except BaseException as error:  # nobody would take the next message: end, for the supervisor to restart it
-            self._break_off(error, self._started if envelope is None else envelope.reply_to)
-        await self._end()
+            self._rr_break_off(error, self._rr_started if envelope is None else envelope.reply_to)
+        await self._rr_end()
 
-    def _break_off(self, error: BaseException, reply: pykka.Future[Any] | None) -> None:
+    def _rr_break_off(self, error: BaseException, reply: pykka.Future[Any] | None) -> None:
         """End this actor, as a turn of it has ended by an error that was not expected there."""
-        self._vanish()
-        self._note_failure(error)
+        self._rr_vanish()
+        self._rr_note_failure(error)
         if reply is not None:
-            text = f"{self._target.name} ended, as its turn raised {raised_by(error).text}"
+            text = f"{self._rr_target.name} ended, as its turn raised {raised_by(error).text}"
             with contextlib.suppress(queue.Full):  # it is answered already
-                fail(reply, Ended(text, self._target.name))
+                fail(reply, Ended(text, self._rr_target.name))
 
-    async def _begin(self) -> bool:
-        doing = Activity(self._target, ())
+    async def _rr_begin(self) -> bool:
+        doing = Activity(self._rr_target, ())
         activity.set(doing)
         failure: BaseException | None = None
         answer: Any = None
         try:
-            await self._hook(BaseActor._before_start, self._place)
-            self._begun = True
+            await self._rr_hook(BaseActor._rr_before_start, self._rr_place)
+            self._rr_begun = True
             doing.starts_in = here()
             answer = self.on_start()
             if is_coroutine(answer):
                 answer = await Await(closing(answer, _start(answer, doing)))
             if answer is not IGNORE:
-                await self._hook(BaseActor._after_start)
+                await self._rr_hook(BaseActor._rr_after_start)
         except BaseException as error:
             failure = error
         finally:
             doing.active = False
         if failure is None and answer is not IGNORE:
-            self._started.set(None)
+            self._rr_started.set(None)
             return True
-        self._vanish()
-        self._on_exit = None
+        self._rr_vanish()
+        self._rr_on_exit = None
         if failure is not None:
             raised = raised_by(failure)
-            self._report = abnormal(raised)
+            self._rr_report = abnormal(raised)
             failure = failure if isinstance(failure, Exception) else raised.error
-        await self._end()
+        await self._rr_end()
         if failure is None:
-            self._started.set(IGNORE)
+            self._rr_started.set(IGNORE)
         else:
-            fail(self._started, exit_reports.as_heard(failure, self._target.name))
+            fail(self._rr_started, exit_reports.as_heard(failure, self._rr_target.name))
         return False
 
-    async def _handle(self, envelope: PykkaEnvelope[Any]) -> None:
+    async def _rr_handle(self, envelope: PykkaEnvelope[Any]) -> None:
         message, reply = envelope.message, envelope.reply_to
         if isinstance(envelope, DownNotice):
             monitor = cast("Monitor", envelope.claim)
-            self._monitors.discard(monitor)
+            self._rr_monitors.discard(monitor)
             if take(monitor) is None:
                 return
-        doing = Activity(self._target, getattr(envelope, "chain", ()))
+        doing = Activity(self._rr_target, getattr(envelope, "chain", ()))
         activity.set(doing)
         stamp: Stamp | None = getattr(envelope, "stamp", None)
         if stamp is not None:
             doing.message = stamp.id
-            notes.received(stamp, self._target.name)
+            notes.received(stamp, self._rr_target.name)
         failure: BaseException | None = None
         try:
             if type(message) is Packed:
                 try:
                     message = message.open()
                 except BaseException as error:  # an error of the sender, not of this actor
-                    self._not_opened(message, error, reply)
+                    self._rr_not_opened(message, error, reply)
                     return
             if is_stop(message):
-                await self._stop_now(message, reply)
+                await self._rr_stop_now(message, reply)
                 return
             if isinstance(reply, Reply) and not reply.set_running_or_notify_cancel():
                 return
@@ -370,7 +374,7 @@ class BaseActor(pykka.Actor):
                 result = await Await(result)
             if reply is not None:
                 if stamp is not None:
-                    notes.answered(stamp, self._target.name, result)
+                    notes.answered(stamp, self._rr_target.name, result)
                 reply.set(as_answer(self, self.actor_ref, message, result))
         except BaseException as error:
             failure = error
@@ -379,84 +383,84 @@ class BaseActor(pykka.Actor):
         if failure is None:
             return
         if stamp is not None and reply is not None:
-            notes.raised(stamp, self._target.name, failure)
+            notes.raised(stamp, self._rr_target.name, failure)
         if not isinstance(failure, Exception):
-            await self._leave(failure, reply)
+            await self._rr_leave(failure, reply)
         elif reply is None:
-            await self._fail(failure)
+            await self._rr_fail(failure)
         else:
             fail(reply, failure)
             logger.info("Exception returned from %s to caller:", self, exc_info=failure)
         del envelope, reply, failure  # the traceback has this frame
 
-    def _not_opened(self, packed: Packed, error: BaseException, reply: pykka.Future[Any] | None) -> None:
+    def _rr_not_opened(self, packed: Packed, error: BaseException, reply: pykka.Future[Any] | None) -> None:
         if reply is None:
             logger.error("a message for %s cannot be opened here, and is dropped", self, exc_info=error)
             why = f"cannot be opened: {shortened(text_of(error))}"
-            dead_letters.office.record(self._target.name, [packed], why, unheard=0)  # the log has it
+            dead_letters.office.record(self._rr_target.name, [packed], why, unheard=0)  # the log has it
         else:
             fail(reply, error)
 
-    async def _stop_now(self, message: object, reply: pykka.Future[Any] | None) -> None:
+    async def _rr_stop_now(self, message: object, reply: pykka.Future[Any] | None) -> None:
         if reply is not None:
-            self._stop_replies.append(reply)
-        self._final = getattr(message, "final", False)
-        await self._stop_gracefully(ExitReport(getattr(message, "reason", "normal"), "stopped"))
+            self._rr_stop_replies.append(reply)
+        self._rr_final = getattr(message, "final", False)
+        await self._rr_stop_gracefully(ExitReport(getattr(message, "reason", "normal"), "stopped"))
 
-    async def _stop_gracefully(self, report: ExitReport) -> None:
-        self._vanish()
-        self._report = report
+    async def _rr_stop_gracefully(self, report: ExitReport) -> None:
+        self._rr_vanish()
+        self._rr_report = report
         logger.debug("Stopped %s", self)
         try:
-            await self._user(self.on_stop)
+            await self._rr_user(self.on_stop)
         except BaseException as error:
-            self._note_failure(error)
+            self._rr_note_failure(error)
 
-    async def _leave(self, error: BaseException, reply: pykka.Future[Any] | None) -> None:
+    async def _rr_leave(self, error: BaseException, reply: pykka.Future[Any] | None) -> None:
         """End this actor, and no other, after SystemExit or the like in a handler."""
         if reply is not None:
-            text = f"{self._target.name} ended while it handled the message: {raised_by(error).text}"
-            dead = Ended(text, self._target.name)
+            text = f"{self._rr_target.name} ended while it handled the message: {raised_by(error).text}"
+            dead = Ended(text, self._rr_target.name)
             dead.__cause__ = error
             reply.set_exception((Ended, dead, None))
         if isinstance(error, SystemExit) and not error.code:
-            await self._stop_gracefully(ExitReport("normal", "SystemExit"))
+            await self._rr_stop_gracefully(ExitReport("normal", "SystemExit"))
         else:
-            await self._fail(error)
+            await self._rr_fail(error)
 
-    async def _fail(self, error: BaseException) -> None:
-        self._vanish()
-        self._note_failure(error)
+    async def _rr_fail(self, error: BaseException) -> None:
+        self._rr_vanish()
+        self._rr_note_failure(error)
         try:
-            await self._user(self.on_failure, type(error), error, error.__traceback__)
+            await self._rr_user(self.on_failure, type(error), error, error.__traceback__)
         except BaseException as another:
             log_raised(logger, raised_by(another), "on_failure of %s raised:", self)
 
-    async def _end(self) -> None:
-        self._handled = None
+    async def _rr_end(self) -> None:
+        self._rr_handled = None
         left: list[PykkaEnvelope[Any]] = []
-        for envelope in self._mailbox.close():
+        for envelope in self._rr_mailbox.close():
             if envelope.reply_to is not None and is_stop(envelope.message):
-                self._stop_replies.append(envelope.reply_to)
+                self._rr_stop_replies.append(envelope.reply_to)
             else:
                 left.append(envelope)
-        refuse_all(left, self._target.name)
-        for monitor in list(self._monitors):
+        refuse_all(left, self._rr_target.name)
+        for monitor in list(self._rr_monitors):
             monitor.demonitor()
-        if self._begun:
+        if self._rr_begun:
             try:
-                await self._hook(BaseActor._after_stop, self._final)
+                await self._rr_hook(BaseActor._rr_after_stop, self._rr_final)
             except BaseException as error:
-                self._note_failure(error)
-        death_watch.ended(self.actor_stopped, self._report)
+                self._rr_note_failure(error)
+        death_watch.ended(self.actor_stopped, self._rr_report)
         try:
-            self._dispatcher.call(self._ended, self._on_exit, self._report, self._stop_replies)
+            self._rr_dispatcher.call(self._rr_ended, self._rr_on_exit, self._rr_report, self._rr_stop_replies)
         except Unavailable:  # the loop has ended
-            for reply in self._stop_replies:
+            for reply in self._rr_stop_replies:
                 reply.set(None)
 
     @staticmethod
-    def _ended(on_exit: OnExit | None, report: ExitReport, stop_replies: list[pykka.Future[Any]]) -> None:
+    def _rr_ended(on_exit: OnExit | None, report: ExitReport, stop_replies: list[pykka.Future[Any]]) -> None:
         with contextlib.ExitStack() as steps:  # the last one is the first; each is done, whatever another one raises
             steps.callback(release)
             if on_exit is not None:
@@ -464,23 +468,23 @@ class BaseActor(pykka.Actor):
             for reply in stop_replies:  # before on_exit: that may end this process, and an answer would be lost
                 steps.callback(reply.set, None)
 
-    def _vanish(self) -> None:
+    def _rr_vanish(self) -> None:
         if running.get(self.actor_urn) is self.actor_ref:
             del running[self.actor_urn]
         if self.actor_ref.path is None:
             ActorRegistry.unregister(self.actor_ref)
         self.actor_stopped.set()
 
-    def _note_failure(self, error: BaseException) -> None:
+    def _rr_note_failure(self, error: BaseException) -> None:
         raised = raised_by(error)
         log_raised(logger, raised, "Unhandled exception in %s:", self)
-        self._report = abnormal(raised)
+        self._rr_report = abnormal(raised)
 
-    async def _user(self, fn: Callable[..., Any], *args: Any) -> Any:
+    async def _rr_user(self, fn: Callable[..., Any], *args: Any) -> Any:
         result = fn(*args)
         return await Await(result) if is_coroutine(result) else result
 
-    async def _hook(self, hook: Callable[..., Coroutine[Any, Any, None]], *args: Any) -> None:
+    async def _rr_hook(self, hook: Callable[..., Coroutine[Any, Any, None]], *args: Any) -> None:
         mine = getattr(type(self), hook.__name__)
         if mine is not hook:  # go to the loop only if a subclass has overridden the hook
             await Await(mine(self, *args), on_loop=True)
@@ -495,7 +499,7 @@ async def _start(on_start: Coroutine[Any, Any, Any], doing: Activity) -> Any:
 class LoopActor(BaseActor):
     """An actor of the framework: its handlers run on the loop and must not block. An `async def` one delays only it."""
 
-    _lives_on_loop = True
+    _rr_lives_on_loop = True
 
 
 class Actor(BaseActor):

@@ -137,7 +137,7 @@ class TurnActor(BaseActor, abc.ABC):
 
     # In a __dict__ of more than 30 attributes, as these have, CPython 3.11 finds each more slowly than in a slot.
     __slots__ = ("_busy", "_count_users", "_hub", "_is_user", "_scheduled", "is_inside", "lock", "waiting")
-    _lives_on_loop = True
+    _rr_lives_on_loop = True
 
     taken_by_senders: ClassVar[bool] = False
     lock: threading.RLock
@@ -156,7 +156,7 @@ class TurnActor(BaseActor, abc.ABC):
         self._count_users = functools.partial(_locks.count, self.lock)
         self._is_user = False
         self._hub = None  # until its life begins
-        self.waiting = cast("deque[PykkaEnvelope[Any] | Delivery]", self._mailbox.waiting)
+        self.waiting = cast("deque[PykkaEnvelope[Any] | Delivery]", self._rr_mailbox.waiting)
         self._busy = False  # the loop handles messages, or follows: a new message waits until it has finished
         self._scheduled = False  # a turn of the loop is scheduled
         return self
@@ -180,12 +180,12 @@ class TurnActor(BaseActor, abc.ABC):
     @on_loop
     def begin_life(self, dispatcher: Dispatcher, hub: ActorHub) -> None:
         """Take messages from now on, and be found at the actor's path."""
-        self._dispatcher = dispatcher
+        self._rr_dispatcher = dispatcher
         self._hub = hub
-        self._mailbox.begin(self._wake)
-        self._mailbox.rouse_again()
+        self._rr_mailbox.begin(self._wake)
+        self._rr_mailbox.rouse_again()
         death_watch.begin(self.actor_stopped)
-        hub.host(self._target.name, self.actor_ref)
+        hub.host(self._rr_target.name, self.actor_ref)
 
     @on_loop
     def lock_in_use(self, *, in_use: bool) -> None:
@@ -201,10 +201,10 @@ class TurnActor(BaseActor, abc.ABC):
         Deliveries that wait are dropped: their senders send them again, to the next incarnation.
         """
         if (hub := self._hub) is not None:  # else it has not begun
-            hub.remove(self._target.name, self.actor_ref, report)
+            hub.remove(self._rr_target.name, self.actor_ref, report)
         self.actor_stopped.set()
-        left = self._mailbox.close()
-        refuse_all([envelope for envelope in left if not isinstance(envelope, tuple)], self._target.name)
+        left = self._rr_mailbox.close()
+        refuse_all([envelope for envelope in left if not isinstance(envelope, tuple)], self._rr_target.name)
         death_watch.ended(self.actor_stopped, report)
 
     # -- handlers ------------------------------------------------------------------------------------------------------
@@ -222,7 +222,9 @@ class TurnActor(BaseActor, abc.ABC):
         Raises:
             UsageError: always.
         """
-        raise UsageError(f"{self._target.name} takes messages of the framework alone, not {shortened(repr(message))}")
+        raise UsageError(
+            f"{self._rr_target.name} takes messages of the framework alone, not {shortened(repr(message))}"
+        )
 
     # -- messages ------------------------------------------------------------------------------------------------------
 
@@ -301,7 +303,7 @@ class TurnActor(BaseActor, abc.ABC):
         """Put messages back that could not be handled, and handle nothing more before `retry_s` seconds are over."""
         self.waiting.extendleft(reversed(again))
         self.takes = 0
-        self._dispatcher.loop.call_later(retry_s, self._resume)
+        self._rr_dispatcher.loop.call_later(retry_s, self._resume)
 
     def _resume(self) -> None:
         self.takes = AT_ONCE
@@ -309,7 +311,7 @@ class TurnActor(BaseActor, abc.ABC):
 
     def _schedule(self) -> None:
         self._scheduled = True
-        self._dispatcher.loop.call_soon(self._turn)
+        self._rr_dispatcher.loop.call_soon(self._turn)
 
     def _turn(self) -> None:
         self._scheduled = False
@@ -319,13 +321,13 @@ class TurnActor(BaseActor, abc.ABC):
 
     @any_thread
     def _wake(self, _urgent: bool) -> None:
-        self._dispatcher.call(self._woken)
+        self._rr_dispatcher.call(self._woken)
 
     def _woken(self) -> None:
         if self.closed:
             return
-        self._mailbox.rouse_again()  # first: a letter that comes from now on has another turn
-        self._take_letters(self._mailbox.urgent())
+        self._rr_mailbox.rouse_again()  # first: a letter that comes from now on has another turn
+        self._take_letters(self._rr_mailbox.urgent())
         self.take_turns()
 
     def _take_letters(self, letters: Sequence[PykkaEnvelope[Any]]) -> None:
@@ -335,7 +337,9 @@ class TurnActor(BaseActor, abc.ABC):
                 continue
             try:
                 if is_stop(message):
-                    raise UsageError(f"{self._target.name} is a part of another actor, and ends with that: stop that")
+                    raise UsageError(
+                        f"{self._rr_target.name} is a part of another actor, and ends with that: stop that"
+                    )
                 result = self.on_receive(message)
             except Exception as error:
                 self._refuse(message, reply, error)
@@ -347,7 +351,7 @@ class TurnActor(BaseActor, abc.ABC):
         if reply is not None:
             fail(reply, error)
         else:
-            dead_letters.office.record(self._target.name, [message], shortened(text_of(error)), unheard=1)
+            dead_letters.office.record(self._rr_target.name, [message], shortened(text_of(error)), unheard=1)
 
 
 # -- interruptions -----------------------------------------------------------------------------------------------------

@@ -137,7 +137,7 @@ class Components(Manager):
     that fails again and again waits longer each time, with a WARNING, and is given up after ten failures in a row.
     """
 
-    _side_by_side = True
+    _rr_side_by_side = True
 
     def __init__(self, registry: str, programs: str = "programs/program", replace: bool = True) -> None:
         """Read the components from the TOML file `registry`.
@@ -162,7 +162,7 @@ class Components(Manager):
         self._retries.stop()
 
     def _read(self) -> list[ComponentDescription]:
-        return read_registry(self._path, self._beginning())
+        return read_registry(self._path, self._rr_beginning())
 
     @server("component")
     def load_component(self, request: LoadComponent) -> Component:
@@ -215,7 +215,7 @@ class Components(Manager):
             return None
         part = next(iter(self.registrar.children(me.resource_id)), None)
         if part is not None and part.state is not State.FATAL:
-            programs = registrar_in(self._node, part.registrar, patient=True, owner=self)
+            programs = registrar_in(self._rr_node, part.registrar, patient=True, owner=self)
             with contextlib.suppress(UnknownQuery):  # it is gone
                 programs.send_status(part.resource_id, Status(State.FATAL, status.message))
         return part

@@ -132,7 +132,7 @@ class Programs(Manager):
     Programs must stay in the foreground: a daemon that a program leaves is ended with it. Linux only.
     """
 
-    _side_by_side = True
+    _rr_side_by_side = True
 
     def __init__(
         self,
@@ -178,7 +178,7 @@ class Programs(Manager):
     def on_stop(self) -> None:
         """Stop watching the programs. They run until their holders release them; a last stop ends those that start."""
         self._is_stopped.set()
-        self._external.close(final=self._final)
+        self._external.close(final=self._rr_final)
         if self._output_log is not None:
             self._output_log.close()
 
@@ -200,7 +200,7 @@ class Programs(Manager):
             raise NotFound(text, id=program, known=known)
         return list(self._external.last_output(program, lines))
 
-    @server("program", idle="pause", health=Health())  # each as its request and its manager say: see _adapted()
+    @server("program", idle="pause", health=Health())  # each as its request and its manager say: see _rr_adapted()
     def run_program(self, request: RunProgram) -> Program:
         """Start a program, or adopt one that an interrupted load has started."""
         me = current()
@@ -267,7 +267,7 @@ class Programs(Manager):
         if (check := self._checks.get(current().resource_id)) is not None:
             check.begin_anew()
 
-    def _adapted(self, spec: ServerSpec) -> ServerSpec:
+    def _rr_adapted(self, spec: ServerSpec) -> ServerSpec:
         unused = {} if self._pauses else {"pause": None, "resume": None}
         spec = costing(spec, _cost, self._cost_from, self)
         return checked_whole(checked_spec(replace(spec, **self._idleness, **unused, health=HealthOf(self._health_of))))

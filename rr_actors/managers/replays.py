@@ -84,7 +84,7 @@ class Replays(Manager):
     WARNING. Who holds a resource of that file hears FATAL.
     """
 
-    _side_by_side = True
+    _rr_side_by_side = True
 
     def __init__(self, files: Sequence[str | os.PathLike[str]], *, speed: float = 1.0, loop: bool = True) -> None:
         """Read what the files of rr.record_stream() have; their values are read when they are due.
@@ -107,7 +107,7 @@ class Replays(Manager):
             raise UsageError(f"Replays: files: expected a list of files, got {shown(cast('object', files))}")
         self._servers: dict[str, _Server] = {}
         self._speed, self._loops = float(speed), loop
-        beginning = self._beginning()
+        beginning = self._rr_beginning()
         if beginning is None:
             self._read_files(files, {})
         else:

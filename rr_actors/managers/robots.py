@@ -92,7 +92,7 @@ class Robots(Manager):
     The holders of a robot hear UPDATE when a part was replaced. They hear FATAL only if no component could replace it.
     """
 
-    _side_by_side = True
+    _rr_side_by_side = True
 
     def __init__(self, descriptions: str, components: str = "components/component", replace: bool = True) -> None:
         """Read the robots from the TOML file `descriptions`.
@@ -103,7 +103,7 @@ class Robots(Manager):
             ConfigError: the file cannot be read, or is wrong. `.file`, `.key`, `.expected`, `.got`
         """
         self._path = path_of(descriptions, "Robots", "descriptions")
-        self._robots = read_robots(self._path, self._beginning())
+        self._robots = read_robots(self._path, self._rr_beginning())
         self._components = components
         self._replace = replace
         self._retries = Retries[tuple[str, str, str]]()  # of parts, by the id of the robot, the type and the number

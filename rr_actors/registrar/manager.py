@@ -87,9 +87,9 @@ class Manager(Actor):
     registrar: Registrar = cast("Registrar", _NotYet())
     """This manager's registrar. It exists before the first recover callback, and so before on_start."""
 
-    _side_by_side: ClassVar[bool] = False  # it must not be serial: of a ready-made manager
+    _rr_side_by_side: ClassVar[bool] = False  # it must not be serial: of a ready-made manager
 
-    _gate: Gate | None = None  # of a serial manager
+    _rr_gate: Gate | None = None  # of a serial manager
 
     def __init_subclass__(cls, *, serial: bool | None = None, **kwargs: Any) -> None:
         """Make a class of managers; `serial`: whether one callback runs at a time. Default: as its base class."""
@@ -98,8 +98,8 @@ class Manager(Actor):
             if type(serial) is not bool:
                 raise UsageError(f"class {cls.__name__}: serial: expected True or False, got {shown(serial)}")
             cls.serial = serial
-        if cls.serial and cls._side_by_side:
-            ready_made = next(base.__name__ for base in cls.__mro__ if vars(base).get("_side_by_side"))
+        if cls.serial and cls._rr_side_by_side:
+            ready_made = next(base.__name__ for base in cls.__mro__ if vars(base).get("_rr_side_by_side"))
             why = "a ready-made manager, whose callbacks wait for each other"
             raise UsageError(f"class {cls.__name__}: serial: expected False, as it is a {ready_made}: {why}")
 
@@ -115,7 +115,7 @@ class Manager(Actor):
             NotFound: no actor has this id, or several have it; `.known` has the paths that exist.
         """
         where = check_text(id, "ref: expected a child's id or path")
-        return self._node.ref(where, self.actor_ref.path or "")
+        return self._rr_node.ref(where, self.actor_ref.path or "")
 
     @classmethod
     def start(cls, *_args: Any, **_kwargs: Any) -> NoReturn:
@@ -129,9 +129,9 @@ class Manager(Actor):
             f"rr.System([rr.ChildSpec({cls.__name__}, id='...')]).start(), or system.start_child(...) if a system runs"
         )
 
-    def _beginning(self) -> Beginning | None:
+    def _rr_beginning(self) -> Beginning | None:
         """Return the facts of this start, for __init__; None if no system makes this manager."""
-        place = self._place
+        place = self._rr_place
         if place is None:
             return None
         node: Node = place.node
@@ -139,39 +139,39 @@ class Manager(Actor):
         note = functools.partial(node.directory.put_note, place.id)
         return Beginning(place.id, directory, node.info.run_dir, place.by_hand, note)
 
-    async def _before_start(self, place: Any) -> None:
+    async def _rr_before_start(self, place: Any) -> None:
         node: Node = place.node
-        self._node = node
+        self._rr_node = node
         actor = await node.open_registrar(place.id, node.config.registrar(place.id), place.path)
         self.registrar = Registrar(node, actor)
-        self._served = actor
-        actor.gate = self._gate = Gate(1) if self.serial else None
-        actor.on_defect = self._failed
-        place.abandoned = functools.partial(self._close_registrar, None)
+        self._rr_served = actor
+        actor.gate = self._rr_gate = Gate(1) if self.serial else None
+        actor.on_defect = self._rr_failed
+        place.abandoned = functools.partial(self._rr_close_registrar, None)
         try:
-            await node.dispatcher.workers.run(self._register_servers, actor)
+            await node.dispatcher.workers.run(self._rr_register_servers, actor)
             await node.settle(actor)
         except BaseException:
-            self._close_registrar(None)
+            self._rr_close_registrar(None)
             raise
 
-    def _register_servers(self, actor: RegistrarActor) -> None:
+    def _rr_register_servers(self, actor: RegistrarActor) -> None:
         """Register the declared and the stored servers. In a worker: reading types and unpickling run users' code."""
-        declared = self._declared_servers()
+        declared = self._rr_declared_servers()
         for declaration in declared.values():
-            register_spec(self.registrar, self._adapted(spec_for(declaration, self)))
+            register_spec(self.registrar, self._rr_adapted(spec_for(declaration, self)))
         with actor.enter():
             stored_servers = list(actor.whole().stored_servers.values())
         for stored in stored_servers:
             if stored.id not in declared:
                 register_spec(self.registrar, pickling.loads(stored.blob), restored=True)
 
-    def _adapted(self, spec: ServerSpec) -> ServerSpec:
+    def _rr_adapted(self, spec: ServerSpec) -> ServerSpec:
         """Return a declared server as this instance registers it; a ready-made manager's arguments may change it."""
         return spec
 
     @classmethod
-    def _declared_servers(cls) -> dict[str, Declared[Any, Any, Any]]:
+    def _rr_declared_servers(cls) -> dict[str, Declared[Any, Any, Any]]:
         """Return the servers that this class and its base classes declare, by name.
 
         Raises:
@@ -187,30 +187,30 @@ class Manager(Actor):
                 found[attribute.name] = attribute  # pyright: ignore[reportUnknownArgumentType]
         return found
 
-    async def _after_start(self) -> None:
-        if not self._is_mine():
+    async def _rr_after_start(self) -> None:
+        if not self._rr_is_mine():
             raise StartFailed(
                 f"{self.registrar.name}: on_start returned too late: the supervisor has abandoned it",
                 id=self.registrar.name,
             )
-        self._node.serve_registrar(self._served)
+        self._rr_node.serve_registrar(self._rr_served)
 
-    async def _after_stop(self, final: bool) -> None:
-        if final and self._is_mine():
-            await self._node.wind_down(self.registrar.name, self._node.config.stop_timeout_s)
-            self._close_registrar(Presence.GONE)
+    async def _rr_after_stop(self, final: bool) -> None:
+        if final and self._rr_is_mine():
+            await self._rr_node.wind_down(self.registrar.name, self._rr_node.config.stop_timeout_s)
+            self._rr_close_registrar(Presence.GONE)
         else:
-            self._close_registrar(None)
+            self._rr_close_registrar(None)
 
-    def _close_registrar(self, status: Presence | None) -> None:
-        if self._is_mine():
-            self._node.close_registrar(self.registrar.name, status)
+    def _rr_close_registrar(self, status: Presence | None) -> None:
+        if self._rr_is_mine():
+            self._rr_node.close_registrar(self.registrar.name, status)
 
-    def _is_mine(self) -> bool:
+    def _rr_is_mine(self) -> bool:
         """Return whether this manager still owns the registrar of its name: an abandoned one may have a successor."""
-        return self._node.registrars.get(self.registrar.name) is self._served
+        return self._rr_node.registrars.get(self.registrar.name) is self._rr_served
 
-    def _failed(self, error: BaseException) -> None:
+    def _rr_failed(self, error: BaseException) -> None:
         """Make the manager fail with an error of its registrar, or of a thread of its own. From any thread.
 
         Its supervisor then starts it again from the catalog.
@@ -221,9 +221,9 @@ class Manager(Actor):
     def _handle_receive(self, message: Any) -> Any:
         if isinstance(message, _Failed):
             raise message.error
-        if self._gate is None:
+        if self._rr_gate is None:
             return super()._handle_receive(message)
-        return self._gate.around(super()._handle_receive, enters=True)(message)
+        return self._rr_gate.around(super()._handle_receive, enters=True)(message)
 
 
 def ref(id: str) -> ActorRef[Any]:
@@ -249,4 +249,4 @@ def declared_servers(cls: type[Manager]) -> dict[str, Declared[Any, Any, Any]]:
     Raises:
         NameTaken: two methods declare the same name.
     """
-    return cls._declared_servers()  # pyright: ignore[reportPrivateUsage] - same file
+    return cls._rr_declared_servers()  # pyright: ignore[reportPrivateUsage] - same file

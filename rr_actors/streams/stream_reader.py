@@ -266,7 +266,7 @@ class StreamReader:
         was, self._is_unbound = self._is_unbound, True  # also if a signal handler raises meanwhile
         if not self._wake.take() and not was:
             self._is_unbound = False
-        if self._is_unbound or self._stream is None:  # nobody says when a resource has its first stream
+        if self._is_unbound or self._stream is None:  # nothing tells it that a stream is opened
             self._bind()
             self._is_unbound = False
 

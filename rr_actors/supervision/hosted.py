@@ -78,7 +78,7 @@ BRUTAL_GRACE_S = 0.1
 
 
 class ActorPlace:
-    """The place of an actor in a process, given to its hook _before_start.
+    """The place of an actor in a process, given to its hook _rr_before_start.
 
     Attributes:
         node: the process's runtime.

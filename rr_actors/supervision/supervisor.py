@@ -148,7 +148,7 @@ class SupervisorActor(LoopActor):
         self._all_up: asyncio.Future[None]
         self._all_down: asyncio.Future[ExitSupervisor]
 
-    async def _before_start(self, place: ActorPlace) -> None:
+    async def _rr_before_start(self, place: ActorPlace) -> None:
         loop = asyncio.get_running_loop()
         self._all_up, self._all_down = loop.create_future(), loop.create_future()
         self._supervision = Supervision(
@@ -165,7 +165,7 @@ class SupervisorActor(LoopActor):
     @property
     def is_starting(self) -> bool:
         """Whether some children are not ready yet. Until they are, the supervisor does not answer."""
-        return not self._started.done()
+        return not self._rr_started.done()
 
     async def on_start(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]  # LoopActor allows async
         if not self._all_down.done():  # it may have been asked to stop
@@ -174,18 +174,18 @@ class SupervisorActor(LoopActor):
         await self._all_up
 
     async def on_stop(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        self._supervision.stop(final=self._final)
+        self._supervision.stop(final=self._rr_final)
         ending = await self._all_down
         if ending.error is not None:
             text = trace_of(ending.error)
-            self._report = ExitReport("shutdown", text_of(ending.error).partition(": ")[2], ending.error, text)
+            self._rr_report = ExitReport("shutdown", text_of(ending.error).partition(": ")[2], ending.error, text)
 
     async def on_failure(self, *_: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Stop the children after a defect of this class: none must run without a supervisor."""
         self._supervision.stop(final=False)
         await self._all_down
 
-    async def _after_stop(self, final: bool) -> None:
+    async def _rr_after_stop(self, final: bool) -> None:
         await self._supervision.finish()
 
     def _has_ended(self, ending: ExitSupervisor) -> None:
@@ -199,7 +199,7 @@ class SupervisorActor(LoopActor):
 
     # -- calls -----------------------------------------------------------------------------------------------------
 
-    async def _handle(self, envelope: PykkaEnvelope[Any]) -> None:
+    async def _rr_handle(self, envelope: PykkaEnvelope[Any]) -> None:
         message, reply = envelope.message, envelope.reply_to
         if isinstance(message, child_calls.Change):
             self._change(message, reply)  # answered later, so that other messages do not wait
@@ -208,7 +208,7 @@ class SupervisorActor(LoopActor):
                 "supervisor %s: dropped a message that is no supervisor's call: %r", self._supervision.path, message
             )
         else:
-            await super()._handle(envelope)
+            await super()._rr_handle(envelope)
 
     def on_receive(self, message: Any) -> Any:
         supervision = self._supervision

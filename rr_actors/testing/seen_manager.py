@@ -33,36 +33,36 @@ _METHODS = (MethodType, FunctionType, BuiltinFunctionType, functools.partial)
 class SeenManager(Manager):
     """The base of the class that seen_class() makes of the user's class, which is its second base."""
 
-    _notes: ClassVar[str] = ""
+    _rr_notes: ClassVar[str] = ""
 
     def __getattribute__(self, name: str) -> Any:
         value = super().__getattribute__(name)
         if not name.startswith("__") and not issubclass(type(value), _METHODS):
-            lens = _lens_of(type(self)._notes)
+            lens = _lens_of(type(self)._rr_notes)
             lens.note(self, name, None, writes=False, frame=sys._getframe(1))  # pyright: ignore[reportPrivateUsage]
         return value
 
     def __setattr__(self, name: str, value: Any) -> None:
         frame = sys._getframe(1)  # pyright: ignore[reportPrivateUsage]
-        lens = _lens_of(type(self)._notes)
+        lens = _lens_of(type(self)._rr_notes)
         if type(value) in SEEN and sys.getrefcount(value) <= _fresh() and lens.is_users(frame):
             value = SEEN[cast("type[object]", type(value))](value)
-            value.note = functools.partial(self._note_item, lens, name)
+            value.note = functools.partial(self._rr_note_item, lens, name)
         super().__setattr__(name, value)
         lens.note(self, name, None, writes=True, frame=frame)
 
-    def _note_item(self, lens: RaceLens, name: str, key: Hashable, writes: bool) -> None:
+    def _rr_note_item(self, lens: RaceLens, name: str, key: Hashable, writes: bool) -> None:
         frame = sys._getframe(2)  # pyright: ignore[reportPrivateUsage]
         lens.note(self, name, key, writes=writes, frame=frame)
 
-    def _adapted(self, spec: ServerSpec) -> ServerSpec:
-        spec = super()._adapted(spec)
+    def _rr_adapted(self, spec: ServerSpec) -> ServerSpec:
+        spec = super()._rr_adapted(spec)
         roles = {field: role for field, role in ROLES.items() if role is not UPGRADE and getattr(spec, field)}
-        seen = {field: self._seen(getattr(spec, field), role) for field, role in roles.items()}
+        seen = {field: self._rr_seen(getattr(spec, field), role) for field, role in roles.items()}
         return msgspec.structs.replace(spec, **seen)
 
-    def _seen(self, callback: Callback, role: Role) -> Callback:
-        notes, serial = type(self)._notes, type(self).serial
+    def _rr_seen(self, callback: Callback, role: Role) -> Callback:
+        notes, serial = type(self)._rr_notes, type(self).serial
         lens = _lens_of(notes)
         if is_async(callback):
 
@@ -86,7 +86,7 @@ class SeenManager(Manager):
         return seen
 
     def _handle_receive(self, message: Any) -> Any:
-        lens = _lens_of(type(self)._notes)
+        lens = _lens_of(type(self)._rr_notes)
         with lens.run(f"the handler of a {type(message).__name__}", takes_turns=type(self).serial):
             return super()._handle_receive(message)
 
@@ -97,7 +97,7 @@ def seen_class(cls: type[Manager], notes: str) -> type[Manager]:
     Args:
         notes: the directory of the notes, to which races are appended.
     """
-    names = {"_notes": notes, "__module__": __name__, "__qualname__": f"seen.{cls.__qualname__}"}
+    names = {"_rr_notes": notes, "__module__": __name__, "__qualname__": f"seen.{cls.__qualname__}"}
     return type(cls)(cls.__name__, (SeenManager, cls), names)
 
 

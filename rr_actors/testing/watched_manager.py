@@ -56,17 +56,17 @@ class Watch(msgspec.Struct, frozen=True):
 class WatchedManager(SeenManager):
     """The base of the class that check_manager() makes of the user's class, which is its second base."""
 
-    _watch: ClassVar[Watch]
+    _rr_watch: ClassVar[Watch]
 
-    def _adapted(self, spec: ServerSpec) -> ServerSpec:
-        return _watcher(self._watch).watched(super()._adapted(spec))
+    def _rr_adapted(self, spec: ServerSpec) -> ServerSpec:
+        return _watcher(self._rr_watch).watched(super()._rr_adapted(spec))
 
 
 def watched_class(cls: type[Manager], watch: Watch) -> type[Manager]:
     """Return a subclass of a class of managers whose callbacks are noted. It travels by value."""
     names = {
-        "_watch": watch,
-        "_notes": watch.directory,
+        "_rr_watch": watch,
+        "_rr_notes": watch.directory,
         "__module__": __name__,
         "__qualname__": f"watched.{cls.__qualname__}",
     }

@@ -18,6 +18,7 @@ from rr_actors.actors.actor import BATCH, IGNORE, Actor, ExitReport, LoopActor
 from rr_actors.actors.drivers import Driver
 from rr_actors.actors.refs import ActorRef
 from rr_actors.base.errors import MailboxFull, StartFailed, UsageError
+from rr_actors.registrar.manager import Manager
 from rr_actors.runtime.event_loop import Dispatcher, acquire, current, release
 from rr_actors.runtime.workers import Workers
 from support import REPOSITORY, Calls, Gate, eventually
@@ -248,24 +249,52 @@ def test_an_actor_can_be_started_in_another_ones_handler() -> None:
     assert child.ask("child") == "child"
 
 
+def test_private_names_are_left_to_the_users_class() -> None:
+    """A class that keeps its target, its handle or its user in such a name must not break its actor."""
+
+    class Bare(Actor):
+        def on_receive(self, message: Any) -> set[str]:
+            return {*dir(self)}
+
+    names = {name for name in Bare.start().ask("names") | {*dir(Manager)} if name[0] == "_" and name[-2:] != "__"}
+    pykkas = {*dir(pykka.ThreadingActor), "_actor_ref", "_abc_impl"}
+    assert {name for name in names - pykkas if not name.startswith("_rr_")} == set()
+
+
+@pytest.mark.parametrize("name", ["_target", "_handle", "_started", "_mailbox", "_monitors", "_user", "_end", "_hook"])
+def test_an_actor_with_private_names_of_its_own_lives_and_ends_as_any_other(name: str) -> None:
+    class Arm(Actor):
+        def __init__(self) -> None:
+            setattr(self, name, "mine")
+
+        def on_receive(self, message: Any) -> Any:
+            setattr(self, name, message)
+            return getattr(self, name)
+
+    arm = Arm.start()
+    assert [arm.ask(one, timeout=20) for one in (1, 2)] == [1, 2]
+    assert arm.stop(timeout=20)
+    assert not arm.is_alive()
+
+
 def test_launch_starts_an_actor_from_the_loop_and_reports_its_exit(dispatcher: Dispatcher) -> None:
     class Placed(Actor):
         def __init__(self, word: str) -> None:
             self.word = word
 
-        async def _before_start(self, place: Any) -> None:
+        async def _rr_before_start(self, place: Any) -> None:
             steps((f"before {place}", threading.current_thread().name))
 
         def on_start(self) -> None:
             steps(("on_start", threading.current_thread().name.rstrip("0123456789")))
 
-        async def _after_start(self) -> None:
+        async def _rr_after_start(self) -> None:
             steps(("after", threading.current_thread().name))
 
         def on_stop(self) -> None:
             steps(("on_stop", threading.current_thread().name.rstrip("0123456789")))
 
-        async def _after_stop(self, final: bool) -> None:
+        async def _rr_after_stop(self, final: bool) -> None:
             steps((f"after stop, final {final}", threading.current_thread().name))
 
     steps, exits = Calls(), Calls()
@@ -296,13 +325,13 @@ def test_launch_raises_what_init_or_on_start_raised_and_passes_ignore_on(dispatc
                 raise ValueError("not started")
             return IGNORE
 
-        async def _before_start(self, place: Any) -> None:
+        async def _rr_before_start(self, place: Any) -> None:
             steps("before")
 
-        async def _after_start(self) -> None:
+        async def _rr_after_start(self) -> None:
             steps("after")
 
-        async def _after_stop(self, final: bool) -> None:
+        async def _rr_after_stop(self, final: bool) -> None:
             steps("after stop")
 
     exits, steps = Calls(), Calls()

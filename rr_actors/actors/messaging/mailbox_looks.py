@@ -82,7 +82,7 @@ def look_at(ref: pykka.ActorRef[Any]) -> MailboxInfo:
     if not isinstance(mailbox, Mailbox):
         raise UsageError(f"{ref}: expected an actor of rr_actors, got one whose mailbox is {type(mailbox).__name__}")
     actor = ref._actor_weakref()  # pyright: ignore[reportPrivateUsage]  # Pykka's; there is no public way to the actor
-    handled = getattr(actor, "_handled", None)
+    handled = getattr(actor, "_rr_handled", None)
     first: list[Any] = mailbox.first(COUNTED)
     return MailboxInfo(
         str(ref),
@@ -90,7 +90,7 @@ def look_at(ref: pykka.ActorRef[Any]) -> MailboxInfo:
         len(mailbox),
         dict(Counter(type_of(_message(waiting)) for waiting in first)),
         message_info(first[0]) if first else None,
-        None if handled is None else message_info(handled, getattr(actor, "_handled_at", 0.0)),
+        None if handled is None else message_info(handled, getattr(actor, "_rr_handled_at", 0.0)),
         waits_of(ref.actor_urn),
         mailbox.is_paused,
     )
@@ -155,7 +155,7 @@ def _steppable(ref: pykka.ActorRef[Any]) -> SteppedMailbox:
     mailbox = ref.actor_inbox
     if isinstance(mailbox, SteppedMailbox):
         return mailbox
-    if getattr(ref.actor_class, "_lives_on_loop", False):
+    if getattr(ref.actor_class, "_rr_lives_on_loop", False):
         text = "it is an actor of the framework, which other actors need; only your actors and managers can be paused"
         raise UsageError(f"{ref}: {text}")
     start = "start it with System(debug=True), or rr-actors run --debug"

@@ -160,7 +160,7 @@ class Actions(Manager):
     graph goes on after a crash of this manager: no action runs again whose end is on disk.
     """
 
-    _side_by_side = True
+    _rr_side_by_side = True
 
     def __init__(
         self,
@@ -184,7 +184,7 @@ class Actions(Manager):
         """
         if not is_number(stop_s) or stop_s < 0:
             raise UsageError(f"Actions: stop_s: expected a number of at least 0, got {shown(stop_s)}")
-        self._library = GraphLibrary(actions, graphs, action_folder, self._beginning())
+        self._library = GraphLibrary(actions, graphs, action_folder, self._rr_beginning())
         self._stop_s = stop_s
         self._lock = threading.Lock()
         self._engines: dict[str, GraphEngine] = {}
@@ -434,7 +434,7 @@ class Actions(Manager):
             return result_of(kind, action.run(given_to(kind, inputs)))
         name = f"{self.registrar.name}/{name_of(kind)}"
         call = pickling.dumps(functools.partial(run_alone, kind, inputs, action.attempt), f"the isolated action {name}")
-        events, spawner = Events(action.stopping, action.pausing), self._node.spawner
+        events, spawner = Events(action.stopping, action.pausing), self._rr_node.spawner
         ended = run_isolated(
             spawner, call, events, control.begin, name=name, timeout_s=kind.timeout_s, grace_s=self._stop_s
         )

@@ -81,7 +81,7 @@ class Budgets(Manager):
     `status.reason == "revoked"`, and have `grace_s` seconds.
     """
 
-    _side_by_side = True
+    _rr_side_by_side = True
 
     def __init__(self, file_or_pools: str | os.PathLike[str] | Sequence[Pool], grace_s: float = 5.0) -> None:
         """Take pools from a TOML file, or as they are given.
@@ -89,7 +89,7 @@ class Budgets(Manager):
         Raises:
             ConfigError: the file cannot be read, or a pool is wrong. `.file`, `.key`, `.expected`, `.got`
         """
-        self._pools = read_pools(file_or_pools, self._beginning())
+        self._pools = read_pools(file_or_pools, self._rr_beginning())
         check_amount(None, "grace_s", grace_s)
         self._grace_s = min(grace_s, LONGEST_GRACE_S)
         self._waiting: dict[str, _Waiting] = {}
@@ -101,7 +101,7 @@ class Budgets(Manager):
         self._who: dict[str, dict[str, Any]] = {}  # of each pool, the shares by priority and those who wait
         self._measured = dict.fromkeys(self._pools, math.inf)
         self._problems = dict.fromkeys(self._pools, "")  # of the probes
-        self._planning: PlanningLoop[tuple[str, str], str] = PlanningLoop("budgets", self._look, self._failed)
+        self._planning: PlanningLoop[tuple[str, str], str] = PlanningLoop("budgets", self._look, self._rr_failed)
         self._gauges = [
             Gauge(
                 pool.measure,

@@ -72,7 +72,7 @@ class Choices(Manager):
     that message says for each alternative why not. A better one that is well again for `settle_s` takes its place back.
     """
 
-    _side_by_side = True
+    _rr_side_by_side = True
 
     def __init__(
         self,
@@ -92,7 +92,7 @@ class Choices(Manager):
             ConfigError: the file cannot be read, or an alternative or a host is wrong. `.file`, `.key`, `.expected`,
                 `.got`
         """
-        self._given = read_alternatives(file_or_alternatives, self._beginning())
+        self._given = read_alternatives(file_or_alternatives, self._rr_beginning())
         if not is_number(settle_s) or settle_s < 0:
             raise wrong(None, "settle_s", "a number of seconds, at least 0", settle_s, where="Choices")
         for i, host in enumerate(relay_hosts):
@@ -108,7 +108,7 @@ class Choices(Manager):
             self._have_taken,
             lambda: self._offers.has_changed(),
             lambda: strays(self.registrar, self._begun),
-            self._failed,
+            self._rr_failed,
         )
         self._begun = ""
 
@@ -603,7 +603,7 @@ class Choices(Manager):
     @functools.cached_property
     def _offers(self) -> Offers:
         reliabilities = Reliabilities(self.registrar.directory / "reliability.json")
-        return Offers(self._given, Labelled(self._node.directory), reliabilities)
+        return Offers(self._given, Labelled(self._rr_node.directory), reliabilities)
 
     @functools.cached_property
     def _addresses(self) -> Addresses:

@@ -90,7 +90,7 @@ class Keeper(Manager):
     name of a group of the file, whose members are loaded as parts. Kubernetes calls such a manager a controller.
     """
 
-    _side_by_side = True
+    _rr_side_by_side = True
 
     def __init__(self, file: str | os.PathLike[str], backoff: Backoff = BACKOFF) -> None:
         """Read what is to be kept from a TOML file. `backoff`: the waiting times before a replica is loaded again.
@@ -98,11 +98,11 @@ class Keeper(Manager):
         Raises:
             ConfigError: the file cannot be read, or is wrong. `.file`, `.key`, `.expected`, `.got`
         """
-        path, beginning = path_of(file, "Keeper", "file"), self._beginning()
+        path, beginning = path_of(file, "Keeper", "file"), self._rr_beginning()
         name = "keeper" if beginning is None else beginning.name
         self._group_server = f"{name}/group"
         self._configuration = LastGood(beginning, lambda: one_file(path), self._parse)
-        self._loop: PlanningLoop[Slot | str, WantedReplica | None] = PlanningLoop("keeper", self._look, self._failed)
+        self._loop: PlanningLoop[Slot | str, WantedReplica | None] = PlanningLoop("keeper", self._look, self._rr_failed)
         record = None if beginning is None else KeptRecord(beginning.directory / "scales.json", KeptScales)
         self._scaler = Scaler(self._loop, record, self._parts_of, self._registrar_of)
         self._backoff = backoff
@@ -384,7 +384,7 @@ class Keeper(Manager):
             return []
 
     def _registrar_of(self, name: str) -> Registrar:
-        return registrar_in(self._node, name, patient=False, owner=self)
+        return registrar_in(self._rr_node, name, patient=False, owner=self)
 
     def _release(self, one: SeenReplica, parts: Sequence[str]) -> None:
         """Release a replica after its parts. If one cannot be unloaded, it may be running still, and stays a part."""

@@ -79,7 +79,7 @@ class Pipes(Components):
     """
 
     def _read(self) -> list[ComponentDescription]:
-        file = read_pipe_file(self._path, self._beginning())
+        file = read_pipe_file(self._path, self._rr_beginning())
         self._described = {component.name: component for component in file.component}
         self._pipes: list[PipeDescription] = file.pipe
         return [*file.component]

@@ -43,7 +43,7 @@ class _Record(msgspec.Struct):
 class LastGood(Generic[C]):
     """The configuration of a manager that reads files. Make it in the manager's __init__::
 
-        self._configuration = LastGood(self._beginning(), lambda: one_file(path), self._parsed)
+        self._configuration = LastGood(self._rr_beginning(), lambda: one_file(path), self._parsed)
 
     Attributes:
         now: the configuration that holds.

@@ -74,7 +74,7 @@ class PlanningLoop(Generic[K, W]):
             look: called on the thread with the time now, by the monotonic clock. It returns the time at which to look
                 again if nothing happens; None: never.
             fail: makes the manager fail with an error that `look`, or something else on the thread, has raised. Its
-                supervisor then starts the manager again. Pass the manager's `_failed`.
+                supervisor then starts the manager again. Pass the manager's `_rr_failed`.
         """
         self._name, self._look, self._fail = name, look, fail
         self._happened: queue.SimpleQueue[Callable[[], object] | None] = queue.SimpleQueue()

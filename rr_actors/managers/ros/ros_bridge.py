@@ -60,7 +60,7 @@ K = TypeVar("K", Load, Unload, Renew)
 class RosBridge(Manager):
     """What both versions' bridges do. A version's class joins its graph."""
 
-    _side_by_side = True
+    _rr_side_by_side = True
     _discovery_s = DISCOVERY_S
 
     def __init__(
@@ -78,7 +78,7 @@ class RosBridge(Manager):
         elif switches or json is not None:
             raise UsageError(f"{type(self).__name__}: expected a file, or switches and json, got both")
         else:
-            self._exposed = last_good_file(self._beginning(), Path(file).absolute(), parse_exposed).now
+            self._exposed = last_good_file(self._rr_beginning(), Path(file).absolute(), parse_exposed).now
         self._switches = {one.name: one for one in self._exposed.switch}
         self._events = queue.SimpleQueue[Callable[[], Sequence[Action]] | None]()
         self._thread: threading.Thread | None = None
@@ -210,7 +210,7 @@ class RosBridge(Manager):
         try:
             self._go_on(graph)
         except Exception as error:
-            self._failed(error)
+            self._rr_failed(error)
 
     def _go_on(self, graph: RosGraph) -> None:
         look_at = clashes_at = time.monotonic()

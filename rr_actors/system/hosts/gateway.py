@@ -112,7 +112,7 @@ class Gateway(Actor):
         self._hosts = hosts
         self._run: _Run | None = None
 
-    async def _before_start(self, place: Any) -> None:
+    async def _rr_before_start(self, place: Any) -> None:
         self._run = _Run(self._hosts, place.node)
         try:
             await self._run.start()
@@ -120,7 +120,7 @@ class Gateway(Actor):
             await self._run.close()
             raise
 
-    async def _after_stop(self, final: bool) -> None:
+    async def _rr_after_stop(self, final: bool) -> None:
         if self._run is not None:
             await self._run.close()
 
