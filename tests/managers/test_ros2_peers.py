@@ -270,6 +270,26 @@ def test_a_load_that_takes_long_holds_up_no_other_and_no_executor(place: Place) 
     assert nav.until("ok")["answer"]["response"] == {"topic": "/camera/dev/video0"}
 
 
+RAISING = """
+import queue
+from rr_actors.managers.ros.ros2_graph import Ros2Graph
+failures = queue.SimpleQueue()
+hearer, speaker = Ros2Graph("hearer", failures.put), Ros2Graph("speaker", failures.put)
+hearer.hear("/words", int)  # it raises, as a bug in rclpy would
+say = speaker.publish("/words")
+while failures.empty():
+    say("no number")  # the first ones are lost: the hearer is not known yet
+print(failures.get())
+hearer.close()
+speaker.close()
+"""
+
+
+def test_a_node_whose_executor_ends_by_an_error_says_so_and_is_not_deaf(place: Place) -> None:
+    ran = subprocess.run([sys.executable, "-c", RAISING], capture_output=True, text=True, timeout=LIMIT_S, check=True)
+    assert "invalid literal for int()" in ran.stdout
+
+
 def test_a_name_that_another_node_offers_is_refused(place: Place) -> None:
     other = place.peer("other")
     other.do("serve", service="/front_camera/hold")

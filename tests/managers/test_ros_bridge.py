@@ -196,6 +196,43 @@ def test_an_owner_that_never_was_is_refused(place: Place) -> None:
     assert (place.opened, place.held()) == ([], 0)
 
 
+def test_the_bridge_itself_is_no_owner_as_it_would_never_leave(place: Place) -> None:
+    nav = Node(place.world, "nav")
+    (bridge,) = (name for name in place.world.present if name.startswith("/rr_ros_"))
+    heard = list[str]()
+    nav.graph.hear("/rr/answers", heard.append)
+    nav.send("load", id="1", server="cameras/camera", request=DEVICE, owner=bridge)
+    eventually(lambda: heard)
+    assert '"path":"owner"' in heard[0]
+    assert (place.opened, place.held()) == ([], 0)
+
+
+def test_the_leases_of_the_bridge_are_offered_to_nobody(
+    rr_system: Start, request: pytest.FixtureRequest, world: World
+) -> None:
+    options: Any = {"json": ros2.Json(allow=("*/*",))}
+    spec = rr.ChildSpec(FakeBridge, id="ros", args=(request.node.name,), kwargs=options, placement="thread")
+    Place(rr_system([spec]), world)
+    lease = {"owner": "", "id": "front_camera", "server": "cameras/camera", "request": DEVICE}
+    answer = Node(world, "nav").ask("load", id="1", server="ros/lease", request=lease)
+    assert answer["error"]["type"] == "NotAllowed"
+
+
+def test_a_switch_whose_load_a_crash_interrupted_says_that_it_is_there_when_it_is(place: Place) -> None:
+    world = place.world
+    place.goes_on.clear()
+    world.services["/front_camera/hold"](True, lambda ok, text: None)
+    eventually(lambda: place.opened)
+    shown = list[bool]()
+    Node(world, "nav").graph.hear("/front_camera/available", shown.append)
+    place.system.ref("ros").tell("fail")
+    eventually(lambda: shown)
+    assert shown == [False]
+    place.goes_on.set()
+    eventually(lambda: shown[-1])
+    assert place.held() == 1
+
+
 def test_a_name_that_is_taken_is_refused_before_it_is_offered(
     rr_system: Start, request: pytest.FixtureRequest, world: World
 ) -> None:

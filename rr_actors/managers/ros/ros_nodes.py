@@ -103,7 +103,7 @@ class RosNodes(Manager):
 
     @abc.abstractmethod
     def _join(self, node: str) -> NodeGraph:
-        """Be a node of this name in the graph.
+        """Be a node of this name in the graph. If its thread ends by an error, this manager fails with that.
 
         Raises:
             MissingDependency: the libraries of ROS cannot be imported.
