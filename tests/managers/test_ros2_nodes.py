@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -23,6 +24,7 @@ pytest.importorskip("rclpy")
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(240)]
 
 Start = Callable[..., rr.System]
+PAGE = REPOSITORY / "docs" / "ros.md"
 NODE = REPOSITORY / "tests" / "support_ros2_node.py"
 LIMIT_S = 60.0
 
@@ -126,6 +128,36 @@ def test_a_manager_of_nodes_that_is_killed_finds_them_again(place: Place) -> Non
     query.standby()
     eventually(lambda: "camera deactivate" in place.output(query), LIMIT_S)
     query.unload()
+
+
+def test_a_manager_that_is_killed_while_a_node_starts_has_one_node_after_that(place: Place) -> None:
+    load = place.app.load("nodes/node", node("camera", "lifecycle", "late"), timeout_s=120, block=False)
+    programs = place.system.registrar("programs")
+    eventually(programs.resources, LIMIT_S)
+    wait_respawned(place.system, "nodes", kill(place.system, "nodes"))
+    query = load.get(timeout=120)
+    eventually(lambda: [one.response.pid for one in programs.resources()] == [query.response.pid], LIMIT_S)
+    steps = ["camera configure", "camera activate"]
+    eventually(lambda: [line for line in place.output(query) if line.startswith("camera ")] == steps, LIMIT_S)
+
+
+def test_the_program_of_the_page_activates_a_node_of_a_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    blocks = re.findall(r"```text\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    (shown,) = (block for block in blocks if "ros2.Nodes" in block and "import rr_actors" in block)
+    (tmp_path / "page.py").write_text(shown)
+    index = tmp_path / "share" / "ament_index" / "resource_index" / "packages"
+    index.mkdir(parents=True)
+    (index / "my_cameras").touch()
+    driver = tmp_path / "lib" / "my_cameras" / "camera_driver"
+    driver.parent.mkdir(parents=True)
+    driver.write_text(f'#!/bin/sh\nexec {sys.executable} {NODE} lifecycle "$@"\n')
+    driver.chmod(0o755)
+    with domain_of_its_own(monkeypatch, tmp_path):
+        environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "AMENT_PREFIX_PATH": str(tmp_path)}
+        ran = subprocess.run(
+            [sys.executable, "page.py"], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120
+        )
+    assert "/front_camera" in ran.stdout.splitlines(), ran.stdout + ran.stderr
 
 
 def test_a_name_that_a_node_of_another_system_has_is_refused(place: Place) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -223,7 +224,7 @@ def test_a_switch_whose_load_a_crash_interrupted_says_that_it_is_there_when_it_i
     place.goes_on.clear()
     world.services["/front_camera/hold"](True, lambda ok, text: None)
     eventually(lambda: place.opened)
-    shown = list[bool]()
+    shown = list[object]()
     Node(world, "nav").graph.hear("/front_camera/available", shown.append)
     place.system.ref("ros").tell("fail")
     eventually(lambda: shown)
@@ -245,6 +246,21 @@ def test_a_name_that_is_taken_is_refused_before_it_is_offered(
         rr_system([spec])
     assert isinstance(caught.value.__cause__, rr.NameTaken)
     assert world.offered["/front_camera/status"] == set()
+
+
+@pytest.mark.parametrize("kind", [ros2.Bridge, ros2.Nodes])
+def test_without_rclpy_or_with_a_domain_that_is_none_the_start_says_what_to_do(
+    rr_system: Start, monkeypatch: pytest.MonkeyPatch, kind: type[rr.Manager]
+) -> None:
+    options: Any = {"switches": [ros2.Switch("door", "doors/door")]} if kind is ros2.Bridge else {}
+    spec = rr.ChildSpec(kind, id="ros", kwargs=options, placement="thread")
+    monkeypatch.setitem(sys.modules, "rclpy", None)
+    with pytest.raises(rr.StartFailed, match=r"rclpy cannot be imported .* run `source") as caught:
+        rr_system([spec])
+    assert isinstance(caught.value.__cause__, rr.MissingDependency)
+    monkeypatch.setenv("ROS_DOMAIN_ID", "300")
+    with pytest.raises(rr.StartFailed, match="ROS_DOMAIN_ID: expected a whole number from 0 to 232, got '300'"):
+        rr_system([spec])
 
 
 def test_a_second_bridge_with_the_same_topics_does_not_start(place: Place, request: pytest.FixtureRequest) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -16,7 +17,8 @@ from support_ros import DOMAIN, WORLDS, FakeLifecycle, FakeNodes, World
 
 Start = Callable[..., rr.System]
 CAMERA = ros2.RunNode("camera_program", "camera", namespace="/robot", timeout_s=2.0)
-LIFECYCLE = ros2.RunNode("camera_program", "camera", lifecycle=True, timeout_s=2.0)
+QUICK = rr.Health(every_s=0.1, timeout_s=1.0)
+LIFECYCLE = ros2.RunNode("camera_program", "camera", lifecycle=True, timeout_s=2.0, health=QUICK)
 
 
 class Place:
@@ -39,7 +41,7 @@ class Place:
         self.world.lifecycles[name] = self.becomes or FakeLifecycle()
         if self.comes:
             self.world.processes[name].add(f"process {number}")
-        return Program(number, float(number))
+        return Program(number, time.clock_gettime(time.CLOCK_BOOTTIME))
 
     def _end(self, request: RunProgram, response: Program) -> None:
         name = request.instance.removeprefix("node ")
@@ -71,7 +73,8 @@ def place(request: pytest.FixtureRequest, rr_system: Start, world: World) -> Pla
 
 def test_a_node_is_loaded_when_it_is_in_the_graph_and_ended_with_its_last_holder(place: Place) -> None:
     first, second = place.load(CAMERA), place.load(CAMERA)
-    assert first.response == second.response == ros2.RosNode("/robot/camera", 1, 1.0)
+    assert first.response == second.response
+    assert (first.response.name, first.response.pid) == ("/robot/camera", 1)
     (program,) = place.started
     assert program.command == "camera_program"
     assert program.environment == {"ROS_DOMAIN_ID": str(DOMAIN)}
@@ -89,6 +92,33 @@ def test_a_lifecycle_node_is_configured_and_activated_and_at_its_end_the_other_w
     assert node.asked[2:] == ["deactivate", "cleanup"]
     assert place.ended == ["/camera"]
     assert node.is_closed
+
+
+def test_a_node_that_needs_another_is_active_after_it_and_ends_before_it(place: Place) -> None:
+    nodes = {f"/{name}": FakeLifecycle() for name in ("camera", "tracker")}
+
+    def track(request: str) -> str:
+        for name, node in nodes.items():
+            place.becomes = node
+            needed = ros2.RunNode(f"{name}_program", name.removeprefix("/"), lifecycle=True, timeout_s=2.0)
+            robot.load("nodes/node", needed)
+        return "tracks"
+
+    robot = place.system.open_registrar("robot")
+    robot.register_server("tracker", track, lambda request, response: None)
+    steps = list[str]()
+    for name, node in nodes.items():
+        node.hears = lambda step, name=name: steps.append(f"{name} {step}")
+    with place.app.load("robot/tracker", "a face"):
+        assert steps == ["/camera configure", "/camera activate", "/tracker configure", "/tracker activate"]
+    ended = steps[4:]
+    assert ended.index("/tracker deactivate") < ended.index("/camera deactivate")
+    assert sorted(place.ended) == ["/camera", "/tracker"]
+    nodes["/tracker"].refuses = {"activate": "inactive"}
+    with pytest.raises(rr.LoadFailed, match="it has refused 'activate', and is inactive"):
+        place.app.load("robot/tracker", "a face")
+    eventually(lambda: place.programs.resources() == [])
+    assert nodes["/camera"].state == "unconfigured"
 
 
 def test_a_request_for_a_transition_that_is_lost_is_sent_again(place: Place) -> None:
