@@ -95,7 +95,7 @@ def test_a_lifecycle_node_that_was_killed_is_loaded_again_while_the_graph_has_th
     ("word", "timeout_s", "expected"),
     [
         ("refuses", 30.0, "node /camera: it has refused 'configure', and is unconfigured"),
-        ("hangs", 8.0, "node /camera: expected an answer of /camera/get_state within"),
+        ("hangs", 15.0, "node /camera: expected an answer of /camera/get_state within"),
     ],
 )
 def test_a_lifecycle_node_that_does_not_configure_is_ended(
@@ -106,6 +106,13 @@ def test_a_lifecycle_node_that_does_not_configure_is_ended(
     eventually(lambda: not place.system.registrar("programs").resources(), LIMIT_S)
 
 
+def test_a_node_that_is_finalized_is_lost_and_its_program_is_ended_before_its_holders_hear(place: Place) -> None:
+    query = place.load(node("camera", "lifecycle", "breaks"))
+    query.standby()  # it is deactivated for that, and breaks
+    assert "it is finalized" in query.wait_status("FATAL", timeout_s=LIMIT_S).message
+    assert not Path(f"/proc/{query.response.pid}").exists()
+
+
 def test_a_node_that_cannot_start_says_why_at_once(place: Place) -> None:
     broken = ros2.RunNode(sys.executable, "camera", arguments=("-c", "import no_such_rclpy"))
     with pytest.raises(rr.LoadFailed, match="No module named 'no_such_rclpy'"):
@@ -114,7 +121,7 @@ def test_a_node_that_cannot_start_says_why_at_once(place: Place) -> None:
 
 def test_a_node_in_another_domain_is_not_seen_and_the_load_says_in_which_it_is(place: Place) -> None:
     script = f"ROS_DOMAIN_ID=200 exec {sys.executable} {NODE}"
-    request = ros2.RunNode("sh", "camera", arguments=("-c", script), timeout_s=4.0)
+    request = ros2.RunNode("sh", "camera", arguments=("-c", script), timeout_s=5.0)
     with pytest.raises(rr.LoadFailed, match="not there, as its program runs in domain 200"):
         place.load(request)
 

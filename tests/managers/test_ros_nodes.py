@@ -16,9 +16,9 @@ from support import eventually
 from support_ros import DOMAIN, WORLDS, FakeLifecycle, FakeNodes, World
 
 Start = Callable[..., rr.System]
-CAMERA = ros2.RunNode("camera_program", "camera", namespace="/robot", timeout_s=2.0)
+CAMERA = ros2.RunNode("camera_program", "camera", namespace="/robot")
 QUICK = rr.Health(every_s=0.1, timeout_s=1.0)
-LIFECYCLE = ros2.RunNode("camera_program", "camera", lifecycle=True, timeout_s=2.0, health=QUICK)
+LIFECYCLE = ros2.RunNode("camera_program", "camera", lifecycle=True, health=QUICK)
 
 
 class Place:
@@ -100,7 +100,7 @@ def test_a_node_that_needs_another_is_active_after_it_and_ends_before_it(place: 
     def track(request: str) -> str:
         for name, node in nodes.items():
             place.becomes = node
-            needed = ros2.RunNode(f"{name}_program", name.removeprefix("/"), lifecycle=True, timeout_s=2.0)
+            needed = ros2.RunNode(f"{name}_program", name.removeprefix("/"), lifecycle=True)
             robot.load("nodes/node", needed)
         return "tracks"
 
@@ -207,7 +207,7 @@ def test_a_transition_that_nobody_here_asked_for_is_heard(place: Place, state: s
 def test_a_lifecycle_node_that_hangs_is_heard(place: Place) -> None:
     node = place.becomes = FakeLifecycle()
     quick = rr.Health(every_s=0.1, timeout_s=0.1, fail_after=2)
-    query = place.load(ros2.RunNode("camera_program", "camera", lifecycle=True, timeout_s=0.5, health=quick))
+    query = place.load(ros2.RunNode("camera_program", "camera", lifecycle=True, timeout_s=3.0, health=quick))
     node.is_silent = True
     assert "/camera/get_state" in query.wait_status("ERROR", timeout_s=30).message
     query.unload()  # and it is ended, without being deactivated
