@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -28,7 +29,8 @@ class Place:
         self.system, self.world = system, world
         self.started, self.ended = list[RunProgram](), list[str]()
         self.becomes: FakeLifecycle | None = None  # what the next node is
-        self.comes = True
+        self.comes, self.goes_on = True, threading.Event()
+        self.goes_on.set()
         self._numbers = itertools.count(1)
         self.programs = system.open_registrar("programs")
         self.programs.register_server("program", self._run, self._end, request_type=RunProgram)
@@ -41,7 +43,8 @@ class Place:
         self.world.lifecycles[name] = self.becomes or FakeLifecycle()
         if self.comes:
             self.world.processes[name].add(f"process {number}")
-        return Program(number, time.clock_gettime(time.CLOCK_BOOTTIME))
+        self.goes_on.wait(30)
+        return Program(number, time.clock_gettime(time.CLOCK_BOOTTIME) + 3600)  # later than any attempt began
 
     def _end(self, request: RunProgram, response: Program) -> None:
         name = request.instance.removeprefix("node ")
@@ -236,6 +239,19 @@ def test_a_manager_that_fails_finds_its_nodes_again_and_ends_them(place: Place) 
     query.unload()
     assert node.asked == ["configure", "activate", "deactivate", "cleanup"]
     assert (len(place.started), place.ended) == (1, ["/camera"])
+
+
+def test_a_load_that_a_crash_interrupted_does_not_take_another_node_for_its_own(place: Place) -> None:
+    place.comes = False
+    place.goes_on.clear()
+    load = place.app.load("nodes/node", ros2.RunNode("camera_program", "camera", timeout_s=0.3), block=False)
+    eventually(lambda: place.started)
+    place.world.processes["/camera"].add("process 0")  # there before the program that the load starts again
+    place.system.ref("nodes").tell("fail")
+    eventually(lambda: len(place.world.joined) == 2)
+    place.goes_on.set()
+    with pytest.raises(rr.LoadFailed, match="node /camera: expected it in the graph"):
+        load.get(timeout=30)
 
 
 @pytest.mark.parametrize(
