@@ -17,7 +17,7 @@ import rr_actors as rr
 from rr_actors import ros2
 from rr_actors.managers import Programs
 from support import REPOSITORY, eventually, kill, wait_respawned
-from support_ros2 import domain_of_its_own
+from support_ros2 import PatientNodes, domain_of_its_own
 
 pytest.importorskip("rclpy")
 
@@ -167,14 +167,19 @@ def test_the_program_of_the_page_activates_a_node_of_a_package(tmp_path: Path, m
     assert "/front_camera" in ran.stdout.splitlines(), ran.stdout + ran.stderr
 
 
-def test_a_name_that_a_node_of_another_system_has_is_refused(place: Place) -> None:
+def test_a_name_that_a_node_of_another_system_has_is_refused(
+    rr_system: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     command = [sys.executable, str(NODE), "--ros-args", "-r", "__node:=camera"]
-    other = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    try:
-        assert other.stdout is not None
-        assert other.stdout.readline().startswith("/camera is up")
-        with pytest.raises(rr.LoadFailed, match="NameTaken: /camera: a node of this name is in the graph already"):
-            place.load(node("camera"))
-    finally:
-        other.kill()
-        other.communicate()
+    with domain_of_its_own(monkeypatch, tmp_path):
+        other = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        try:
+            assert other.stdout is not None
+            assert other.stdout.readline().startswith("/camera is up")
+            nodes = rr.ChildSpec(PatientNodes, id="nodes", start_timeout_s=60)
+            place = Place(rr_system([rr.ChildSpec(Programs, id="programs"), nodes]))
+            with pytest.raises(rr.LoadFailed, match="NameTaken: /camera: a node of this name is in the graph already"):
+                place.load(node("camera"))
+        finally:
+            other.kill()
+            other.communicate()
