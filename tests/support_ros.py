@@ -130,6 +130,7 @@ class FakeLifecycle:
         self.refuses = dict[str, str]()  # a transition, and the state in which the node is then
         self.loses = list[str]()  # transitions of which the next request does not arrive
         self.is_silent = self.is_closed = False
+        self.hears: Callable[[str], object] = self.asked.append
 
     def ask_state(self) -> Future[str]:
         asked: Future[str] = Future()
@@ -142,7 +143,7 @@ class FakeLifecycle:
         if transition in self.loses:
             self.loses.remove(transition)
         elif not self.is_silent:
-            self.asked.append(transition)
+            self.hears(transition)
             refused = transition in self.refuses
             now = self.refuses[transition] if refused else _TRANSITIONS.get((self.state, transition))
             self.state = now or self.state

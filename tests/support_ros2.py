@@ -1,4 +1,4 @@
-"""A domain of ROS 2 that no other test of this machine has, for tests among real nodes."""
+"""What the tests among real nodes of ROS 2 share: a domain that no other test of this machine has, a patient bridge."""
 
 from __future__ import annotations
 
@@ -10,7 +10,21 @@ from pathlib import Path
 
 import pytest
 
+from rr_actors import ros2
+
 _FIRST, _LAST = 1, 101  # above, the ports of a domain are among those that the kernel gives out
+
+
+class PatientBridge(ros2.Bridge):
+    """A bridge that has seen the other nodes before it looks for a name that is taken, on a busy machine, too."""
+
+    _discovery_s = 8.0
+
+
+class PatientNodes(ros2.Nodes):
+    """The same of a manager of nodes."""
+
+    _discovery_s = 8.0
 
 
 @contextlib.contextmanager

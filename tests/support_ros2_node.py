@@ -1,6 +1,7 @@
 """A node of ROS 2 in a process of its own: `python support_ros2_node.py [WORD...] --ros-args ...`, with these words:
 
-lifecycle  it is a lifecycle node, and prints each transition; refuses: it does not configure; hangs: not at all
+lifecycle  it is a lifecycle node, and prints each transition
+refuses    it does not configure; hangs: it does not answer that; breaks: it is finalized when it is deactivated
 late       it comes into the graph after a second
 deaf       it ignores SIGINT and SIGTERM
 """
@@ -34,7 +35,12 @@ class Stepwise(LifecycleNode):
         return self._step("activate")
 
     def on_deactivate(self, state):
-        return self._step("deactivate")
+        self._step("deactivate")
+        return TransitionCallbackReturn.ERROR if "breaks" in WORDS else TransitionCallbackReturn.SUCCESS
+
+    def on_error(self, state):
+        self._step("error")
+        return TransitionCallbackReturn.FAILURE
 
     def on_cleanup(self, state):
         return self._step("cleanup")

@@ -119,6 +119,30 @@ def test_a_lease_ends_if_it_is_not_renewed() -> None:
     assert "the lease of 5 s" not in str(refusal(one.renew(Renew("1", NAV), 9.1)))
 
 
+@pytest.mark.parametrize("is_switch", [False, True])
+def test_a_release_that_nobody_waits_for_is_tried_again_until_it_is_done(is_switch: bool) -> None:
+    one = book()
+    if is_switch:
+        (begin,) = one.switch_on("light", CAM, "1", 0, 0.0)
+        one.loaded(1, "q1", "feed", 0.0)
+        one.heard(1, Say(("", ""), "q1", "FATAL", "it burnt out"))
+        release, begin = one.switch_on("light", CAM, "1", 0, 1.0)
+        assert isinstance(begin, Begin)
+    else:
+        one.load(load(), 0.0, HERE)
+        one.unload(Unload("1", NAV))  # withdrawn, but it had just been loaded
+        (release,) = one.loaded(1, "q1", "feed", 1.0)
+    assert release == Release(1, "q1")
+    failed = rr.UnloadFailed("it is stuck", server=CAM)
+    for at in (2.0, 2.0 + RETRY_S):
+        assert one.released(1, failed, at) == []
+        assert one.tick(at + RETRY_S - 0.1, HERE) == []
+        assert one.tick(at + RETRY_S, HERE) == [release]
+        assert one.tick(at + RETRY_S, HERE) == []  # its end is not heard yet
+    assert one.released(1, None, 99.0) == []
+    assert one.tick(999.0, HERE) == []
+
+
 def test_a_lease_that_ends_withdraws_a_load() -> None:
     one = book()
     one.load(load(lease_s=5.0), 0.0, HERE)

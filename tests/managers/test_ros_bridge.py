@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -195,6 +196,43 @@ def test_an_owner_that_never_was_is_refused(place: Place) -> None:
     assert (place.opened, place.held()) == ([], 0)
 
 
+def test_the_bridge_itself_is_no_owner_as_it_would_never_leave(place: Place) -> None:
+    nav = Node(place.world, "nav")
+    (bridge,) = (name for name in place.world.present if name.startswith("/rr_ros_"))
+    heard = list[str]()
+    nav.graph.hear("/rr/answers", heard.append)
+    nav.send("load", id="1", server="cameras/camera", request=DEVICE, owner=bridge)
+    eventually(lambda: heard)
+    assert '"path":"owner"' in heard[0]
+    assert (place.opened, place.held()) == ([], 0)
+
+
+def test_the_leases_of_the_bridge_are_offered_to_nobody(
+    rr_system: Start, request: pytest.FixtureRequest, world: World
+) -> None:
+    options: Any = {"json": ros2.Json(allow=("*/*",))}
+    spec = rr.ChildSpec(FakeBridge, id="ros", args=(request.node.name,), kwargs=options, placement="thread")
+    Place(rr_system([spec]), world)
+    lease = {"owner": "", "id": "front_camera", "server": "cameras/camera", "request": DEVICE}
+    answer = Node(world, "nav").ask("load", id="1", server="ros/lease", request=lease)
+    assert answer["error"]["type"] == "NotAllowed"
+
+
+def test_a_switch_whose_load_a_crash_interrupted_says_that_it_is_there_when_it_is(place: Place) -> None:
+    world = place.world
+    place.goes_on.clear()
+    world.services["/front_camera/hold"](True, lambda ok, text: None)
+    eventually(lambda: place.opened)
+    shown = list[object]()
+    Node(world, "nav").graph.hear("/front_camera/available", shown.append)
+    place.system.ref("ros").tell("fail")
+    eventually(lambda: shown)
+    assert shown == [False]
+    place.goes_on.set()
+    eventually(lambda: shown[-1])
+    assert place.held() == 1
+
+
 def test_a_name_that_is_taken_is_refused_before_it_is_offered(
     rr_system: Start, request: pytest.FixtureRequest, world: World
 ) -> None:
@@ -207,6 +245,21 @@ def test_a_name_that_is_taken_is_refused_before_it_is_offered(
         rr_system([spec])
     assert isinstance(caught.value.__cause__, rr.NameTaken)
     assert world.offered["/front_camera/status"] == set()
+
+
+@pytest.mark.parametrize("kind", [ros2.Bridge, ros2.Nodes])
+def test_without_rclpy_or_with_a_domain_that_is_none_the_start_says_what_to_do(
+    rr_system: Start, monkeypatch: pytest.MonkeyPatch, kind: type[rr.Manager]
+) -> None:
+    options: Any = {"switches": [ros2.Switch("door", "doors/door")]} if kind is ros2.Bridge else {}
+    spec = rr.ChildSpec(kind, id="ros", kwargs=options, placement="thread")
+    monkeypatch.setitem(sys.modules, "rclpy", None)
+    with pytest.raises(rr.StartFailed, match=r"rclpy cannot be imported .* run `source") as caught:
+        rr_system([spec])
+    assert isinstance(caught.value.__cause__, rr.MissingDependency)
+    monkeypatch.setenv("ROS_DOMAIN_ID", "300")
+    with pytest.raises(rr.StartFailed, match="ROS_DOMAIN_ID: expected a whole number from 0 to 232, got '300'"):
+        rr_system([spec])
 
 
 def test_a_second_bridge_with_the_same_topics_does_not_start(place: Place, request: pytest.FixtureRequest) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import threading
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -15,8 +17,9 @@ from support import eventually
 from support_ros import DOMAIN, WORLDS, FakeLifecycle, FakeNodes, World
 
 Start = Callable[..., rr.System]
-CAMERA = ros2.RunNode("camera_program", "camera", namespace="/robot", timeout_s=2.0)
-LIFECYCLE = ros2.RunNode("camera_program", "camera", lifecycle=True, timeout_s=2.0)
+CAMERA = ros2.RunNode("camera_program", "camera", namespace="/robot")
+QUICK = rr.Health(every_s=0.1, timeout_s=1.0)
+LIFECYCLE = ros2.RunNode("camera_program", "camera", lifecycle=True, health=QUICK)
 
 
 class Place:
@@ -26,7 +29,8 @@ class Place:
         self.system, self.world = system, world
         self.started, self.ended = list[RunProgram](), list[str]()
         self.becomes: FakeLifecycle | None = None  # what the next node is
-        self.comes = True
+        self.comes, self.goes_on = True, threading.Event()
+        self.goes_on.set()
         self._numbers = itertools.count(1)
         self.programs = system.open_registrar("programs")
         self.programs.register_server("program", self._run, self._end, request_type=RunProgram)
@@ -39,7 +43,8 @@ class Place:
         self.world.lifecycles[name] = self.becomes or FakeLifecycle()
         if self.comes:
             self.world.processes[name].add(f"process {number}")
-        return Program(number, float(number))
+        self.goes_on.wait(30)
+        return Program(number, time.clock_gettime(time.CLOCK_BOOTTIME) + 3600)  # later than any attempt began
 
     def _end(self, request: RunProgram, response: Program) -> None:
         name = request.instance.removeprefix("node ")
@@ -71,7 +76,8 @@ def place(request: pytest.FixtureRequest, rr_system: Start, world: World) -> Pla
 
 def test_a_node_is_loaded_when_it_is_in_the_graph_and_ended_with_its_last_holder(place: Place) -> None:
     first, second = place.load(CAMERA), place.load(CAMERA)
-    assert first.response == second.response == ros2.RosNode("/robot/camera", 1, 1.0)
+    assert first.response == second.response
+    assert (first.response.name, first.response.pid) == ("/robot/camera", 1)
     (program,) = place.started
     assert program.command == "camera_program"
     assert program.environment == {"ROS_DOMAIN_ID": str(DOMAIN)}
@@ -89,6 +95,33 @@ def test_a_lifecycle_node_is_configured_and_activated_and_at_its_end_the_other_w
     assert node.asked[2:] == ["deactivate", "cleanup"]
     assert place.ended == ["/camera"]
     assert node.is_closed
+
+
+def test_a_node_that_needs_another_is_active_after_it_and_ends_before_it(place: Place) -> None:
+    nodes = {f"/{name}": FakeLifecycle() for name in ("camera", "tracker")}
+
+    def track(request: str) -> str:
+        for name, node in nodes.items():
+            place.becomes = node
+            needed = ros2.RunNode(f"{name}_program", name.removeprefix("/"), lifecycle=True)
+            robot.load("nodes/node", needed)
+        return "tracks"
+
+    robot = place.system.open_registrar("robot")
+    robot.register_server("tracker", track, lambda request, response: None)
+    steps = list[str]()
+    for name, node in nodes.items():
+        node.hears = lambda step, name=name: steps.append(f"{name} {step}")
+    with place.app.load("robot/tracker", "a face"):
+        assert steps == ["/camera configure", "/camera activate", "/tracker configure", "/tracker activate"]
+    ended = steps[4:]
+    assert ended.index("/tracker deactivate") < ended.index("/camera deactivate")
+    assert sorted(place.ended) == ["/camera", "/tracker"]
+    nodes["/tracker"].refuses = {"activate": "inactive"}
+    with pytest.raises(rr.LoadFailed, match="it has refused 'activate', and is inactive"):
+        place.app.load("robot/tracker", "a face")
+    eventually(lambda: place.programs.resources() == [])
+    assert nodes["/camera"].state == "unconfigured"
 
 
 def test_a_request_for_a_transition_that_is_lost_is_sent_again(place: Place) -> None:
@@ -177,7 +210,7 @@ def test_a_transition_that_nobody_here_asked_for_is_heard(place: Place, state: s
 def test_a_lifecycle_node_that_hangs_is_heard(place: Place) -> None:
     node = place.becomes = FakeLifecycle()
     quick = rr.Health(every_s=0.1, timeout_s=0.1, fail_after=2)
-    query = place.load(ros2.RunNode("camera_program", "camera", lifecycle=True, timeout_s=0.5, health=quick))
+    query = place.load(ros2.RunNode("camera_program", "camera", lifecycle=True, timeout_s=3.0, health=quick))
     node.is_silent = True
     assert "/camera/get_state" in query.wait_status("ERROR", timeout_s=30).message
     query.unload()  # and it is ended, without being deactivated
@@ -206,6 +239,19 @@ def test_a_manager_that_fails_finds_its_nodes_again_and_ends_them(place: Place) 
     query.unload()
     assert node.asked == ["configure", "activate", "deactivate", "cleanup"]
     assert (len(place.started), place.ended) == (1, ["/camera"])
+
+
+def test_a_load_that_a_crash_interrupted_does_not_take_another_node_for_its_own(place: Place) -> None:
+    place.comes = False
+    place.goes_on.clear()
+    load = place.app.load("nodes/node", ros2.RunNode("camera_program", "camera", timeout_s=0.3), block=False)
+    eventually(lambda: place.started)
+    place.world.processes["/camera"].add("process 0")  # there before the program that the load starts again
+    place.system.ref("nodes").tell("fail")
+    eventually(lambda: len(place.world.joined) == 2)
+    place.goes_on.set()
+    with pytest.raises(rr.LoadFailed, match="node /camera: expected it in the graph"):
+        load.get(timeout=30)
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import fnmatch
 import itertools
+import math
 from collections import OrderedDict
 from collections.abc import Collection, Iterator
 from typing import Any, Literal
@@ -133,9 +134,15 @@ class Hold(msgspec.Struct):
 class HoldBook:
     """The holds of one bridge. Not thread-safe."""
 
-    def __init__(self, json: Json | None, load_topic: str = "load") -> None:
-        self._json, self._topic = json, load_topic
+    def __init__(self, json: Json | None, load_topic: str = "load", own_server: str = "") -> None:
+        """Make an empty book.
+
+        Args:
+            own_server: that of the leases, which no node may load from: what is in a lease is not checked again.
+        """
+        self._json, self._topic, self._own_server = json, load_topic, own_server
         self._holds: dict[Key, Hold] = {}
+        self._owed: dict[int, tuple[str, float]] = {}  # releases that no hold waits for: the query, when it is due
         self._ended: OrderedDict[Key, str] = OrderedDict()
         self._numbers = itertools.count(1)
 
@@ -193,6 +200,7 @@ class HoldBook:
             return []
         if hold is not None:
             before = [Release(hold.number, hold.query)] if hold.phase == "held" else [Answer("unload", key)]
+            self._owed[hold.number] = hold.query, math.inf
         hold = Hold(next(self._numbers), Lease("", name, server, request, None, priority), "loading", None)
         self._holds[key] = hold
         return [*before, self._begin(hold, now)]
@@ -262,6 +270,7 @@ class HoldBook:
         """Handle that a load has succeeded. If nobody wants it any more, release it."""
         hold = self._of(number)
         if hold is None or hold.phase != "loading":
+            self._owed[number] = query, math.inf
             return [Release(number, query)]
         hold.phase, hold.query, hold.response = "held", query, response
         self._renew(hold, now)
@@ -277,10 +286,13 @@ class HoldBook:
 
     def released(self, number: int, error: RrError | None, now: float) -> list[Action]:
         """Handle that a release has ended. If it is owed to a provider, it is done for the owner."""
-        hold = self._of(number)
+        hold, is_done = self._of(number), error is None or isinstance(error, (UnknownQuery, Unavailable))
         if hold is None:
+            owed = self._owed.pop(number, None)
+            if owed is not None and not is_done:
+                self._owed[number] = owed[0], now + RETRY_S
             return []
-        if error is None or isinstance(error, (UnknownQuery, Unavailable)):
+        if is_done:
             self._end(hold, "it has been released")
             return [Answer("unload", hold.lease.key)] if hold.is_asked else []
         hold.phase, hold.until = "held", None if hold.lease.lease_s is None else now + RETRY_S
@@ -301,7 +313,16 @@ class HoldBook:
 
     def tick(self, now: float, nodes: Collection[str]) -> list[Action]:
         """Handle that time has passed: end what nobody holds any more."""
-        return [action for hold in self.holds() for action in self._looked_at(hold, now, nodes)]
+        due = [(number, query) for number, (query, at) in self._owed.items() if now >= at]
+        self._owed.update((number, (query, math.inf)) for number, query in due)
+        again = [Release(number, query) for number, query in due]
+        return [*again, *(action for hold in self.holds() for action in self._looked_at(hold, now, nodes))]
+
+    def owe(self, query: str) -> list[Action]:
+        """Release a query that no hold has, again and again until it is released."""
+        number = next(self._numbers)
+        self._owed[number] = query, math.inf  # until its end is heard
+        return [Release(number, query)]
 
     def _looked_at(self, hold: Hold, now: float, nodes: Collection[str]) -> Iterator[Action]:
         owner, is_over = hold.lease.owner, hold.until is not None and now >= hold.until
@@ -355,7 +376,7 @@ class HoldBook:
 
     def _check_allowed(self, asked: Load) -> None:
         """Raise the error for what the configuration does not allow."""
-        if self._json is None or not self._allows(self._json, asked.server):
+        if self._json is None or asked.server == self._own_server or not self._allows(self._json, asked.server):
             allowed = () if self._json is None else self._json.allow
             hint = did_you_mean(asked.server, [one for one in allowed if "*" not in one])
             text = f"{self._topic}: server: expected one of {few(allowed) or 'none'}, got {shown(asked.server)}{hint}"

@@ -229,8 +229,11 @@ def _imported(name: str) -> ModuleType:
 class Ros2Graph:
     """A node in the graph of ROS 2, with a context of its own, and the thread that spins it."""
 
-    def __init__(self, node: str) -> None:
+    def __init__(self, node: str, failed: Callable[[BaseException], object]) -> None:
         """Be a node of this name, in the domain that the environment says.
+
+        Args:
+            failed: called once if the thread ends by an error: from then on the node hears nothing.
 
         Raises:
             MissingDependency: rclpy, std_msgs or std_srvs cannot be imported.
@@ -247,7 +250,7 @@ class Ros2Graph:
         self._guard = self._node.create_guard_condition(lambda: None)
         self._executor = ros.executors.SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
-        self._is_closed = False
+        self._failed, self._is_closed = failed, False
         self._lock = threading.Lock()  # to publish or wake, and to leave
         self._thread = threading.Thread(target=self._spin, name="ros spin", daemon=True)
         self._thread.start()
@@ -258,6 +261,7 @@ class Ros2Graph:
         except Exception as error:
             if not self._is_closed:
                 logger.error("the node %s spins no more: %s", self._name, text_of(error))
+                self._failed(error)
 
     @property
     def node(self) -> str:

@@ -28,7 +28,7 @@ from rr_actors.base.errors import RrError, UnknownQuery, UsageError, text_of
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.values.canonical import json_of, shown_plain
 from rr_actors.managers.planning.last_good import last_good_file
-from rr_actors.managers.ros.hold_book import Action, Answer, Begin, HoldBook, Lease, Release, Say, Withdraw
+from rr_actors.managers.ros.hold_book import Action, Answer, Begin, Hold, HoldBook, Lease, Release, Say, Withdraw
 from rr_actors.managers.ros.ros_config import (
     Exposed,
     Json,
@@ -84,6 +84,7 @@ class RosBridge(Manager):
         self._thread: threading.Thread | None = None
         self._graph: RosGraph | None = None
         self._loads: dict[int, Reply[Query]] = {}
+        self._clash = ""  # the one that is in the log
         self._causes: dict[Key, RrError] = {}  # of loads that have failed
         self._calls: dict[tuple[Verb, str], list[Answered]] = defaultdict(list)  # of switches, which wait for an answer
         self._statuses: dict[str, Callable[[str], object]] = {}
@@ -91,7 +92,7 @@ class RosBridge(Manager):
 
     @abc.abstractmethod
     def _join(self, node: str) -> RosGraph:
-        """Be a node of this name in the graph.
+        """Be a node of this name in the graph. If its thread ends by an error, this manager fails with that.
 
         Raises:
             MissingDependency: the libraries of ROS cannot be imported.
@@ -109,7 +110,8 @@ class RosBridge(Manager):
             time.sleep(self._discovery_s)
             check_free(graph, offered_by(self._exposed))
             json = self._exposed.json
-            self._book = HoldBook(json, f"{json.namespace}/load" if json is not None else "load")
+            topic = f"{json.namespace}/load" if json is not None else "load"
+            self._book = HoldBook(json, topic, self._lease_server)
             self._restore()
             for switch in self._exposed.switch:
                 self._offer_switch(graph, switch)
@@ -166,7 +168,7 @@ class RosBridge(Manager):
         self._statuses[name] = graph.publish(status_topic(name), latched=True)
         self._available[name] = graph.show(available_topic(name))
         hold = self._book.hold(("", name))
-        self._available[name](hold is not None and hold.state != "FATAL")
+        self._available[name](_is_usable(hold))
 
         def called(data: bool, answered: Answered) -> None:
             self._tell(functools.partial(self._switched, switch, data, answered))
@@ -217,7 +219,7 @@ class RosBridge(Manager):
         while True:
             now = time.monotonic()
             if now >= look_at:
-                self._carry_out(self._book.tick(now, graph.nodes()))
+                self._carry_out(self._book.tick(now, _present(graph)))
                 look_at = now + _LOOK_S
             if now >= clashes_at:
                 self._look_for_clashes(graph)
@@ -237,11 +239,16 @@ class RosBridge(Manager):
         try:
             check_free(graph, offered_by(self._exposed))
         except RrError as error:
-            logger.warning("%s: %s", self.registrar.name, error)
+            clash = str(error)
+            if clash != self._clash:
+                logger.warning("%s: %s", self.registrar.name, clash)
+            self._clash = clash
+        else:
+            self._clash = ""
 
     def _load(self, asked: Load) -> Sequence[Action]:
         graph = self._graph
-        return self._book.load(asked, time.monotonic(), frozenset() if graph is None else graph.nodes())
+        return self._book.load(asked, time.monotonic(), frozenset() if graph is None else _present(graph))
 
     def _switched(self, switch: Switch, data: bool, answered: Answered) -> Sequence[Action]:
         if data:
@@ -324,7 +331,7 @@ class RosBridge(Manager):
             lease: Lease = query.request
             if not self._book.is_exposed(lease, self._switches):
                 logger.warning("%s: %s is exposed no more, and is released", self.registrar.name, lease.__rr_title__())
-                self._release(0, query.id)
+                self._carry_out(self._book.owe(query.id))
                 continue
             facts = query.id, _plain_response(query), str(query.state)
             number = self._book.restored(lease, *facts, time.monotonic())
@@ -356,7 +363,7 @@ class RosBridge(Manager):
             table = {"error": error_table(action.error)} if action.error is not None else {}
             text = json_of(table or {"query": action.query, "response": action.response})
             hold = self._book.hold(action.key)  # the node that is answered looks at it
-            self._available[id](hold is not None and hold.phase == "held" and hold.state != "FATAL")
+            self._available[id](_is_usable(hold))
             for answered in calls:
                 answered(action.error is None, text)
             return
@@ -374,6 +381,15 @@ class RosBridge(Manager):
             self._statuses[id](json_of(facts))
             if action.state == "FATAL":
                 self._available[id](False)
+
+
+def _is_usable(hold: Hold | None) -> bool:
+    return hold is not None and hold.phase == "held" and hold.state != "FATAL"
+
+
+def _present(graph: RosGraph) -> frozenset[str]:
+    """Return the nodes that may hold something: the bridge itself would never leave."""
+    return graph.nodes() - {graph.node}
 
 
 def _plain_response(query: Query) -> Any:

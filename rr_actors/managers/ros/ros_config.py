@@ -53,7 +53,7 @@ class Json(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         namespace: of the topics: "/rr" gives `/rr/load`, `/rr/answers` and others.
-        allow: the servers that nodes may load from, "cameras/camera" or "cameras/*".
+        allow: the servers that nodes may load from, `cameras/camera` or `cameras/*`.
         max_priority: the highest priority that a node may ask for.
     """
 

@@ -41,6 +41,7 @@ logger = Log("rr_actors.managers.ros")
 _POLL_S = 0.02
 _LOAD_MARGIN_S = 10.0  # for the start of a program that is ready at once
 _END_S = 5.0  # for a program that is called lost
+_TICK_S = 0.05  # a process's start is known to 10 ms
 _LAST_S = 3.0  # for the transitions of a node at the last stop, which has an end
 
 _SEEN: dict[str, tuple[State, str]] = {
@@ -71,7 +72,7 @@ class _Running:
 class RosNodes(Manager):
     """What the managers of nodes of both versions do. A version's class joins its graph."""
 
-    _side_by_side = True
+    _rr_side_by_side = True
     _discovery_s = DISCOVERY_S
 
     def __init__(
@@ -103,7 +104,7 @@ class RosNodes(Manager):
 
     @abc.abstractmethod
     def _join(self, node: str) -> NodeGraph:
-        """Be a node of this name in the graph.
+        """Be a node of this name in the graph. If its thread ends by an error, this manager fails with that.
 
         Raises:
             MissingDependency: the libraries of ROS cannot be imported.
@@ -118,21 +119,23 @@ class RosNodes(Manager):
         """
         self._joined()
 
-    @server("node", idle="pause", health=Health())  # each as its request and its manager say: see _adapted()
+    @server("node", idle="pause", health=Health())  # each as its request and its manager say: see _rr_adapted()
     def run_node(self, request: RunNode) -> RosNode:
         """Start a node, wait until it is in the graph, and configure and activate a lifecycle node.
 
-        A crash may repeat this. The program runs then, and is taken over in the state that its node is in.
+        A crash may repeat this. A program that still runs then is taken over, in the state that its node is in.
         """
         me, graph, name = current(), self._joined(), request.full_name
         check_node(request, graph.domain)
         program = program_of(request, graph.domain, os.environ)
         self._claim(name, me.resource_id)
         try:
-            before = self._before(graph, name, is_first=me.attempt == 1)
+            before, gone = self._before(graph, name, is_first=me.attempt == 1)
+            began = time.clock_gettime(time.CLOCK_BOOTTIME)
             part: Query = self.registrar.load(f"{self._programs}/program", program, timeout_s=_LOAD_MARGIN_S)
             check = functools.partial(_check_wanted, me.stopping, part)
-            running = self._seen(graph, request, part, before, check)
+            is_new = part.response.start_time >= began - _TICK_S
+            running = self._seen(graph, request, part, before if is_new else gone, check)
             self._running[me.resource_id] = running
             if running.lifecycle is not None:
                 bring(name, running.lifecycle, "active", request.timeout_s, check)
@@ -202,7 +205,7 @@ class RosNodes(Manager):
         if running is not None and running.lifecycle is not None:
             bring(response.name, running.lifecycle, "active", request.timeout_s)
 
-    def _adapted(self, spec: ServerSpec) -> ServerSpec:
+    def _rr_adapted(self, spec: ServerSpec) -> ServerSpec:
         unused = {} if self._idleness["idle"] == "pause" else {"pause": None, "resume": None}
         return checked_whole(checked_spec(replace(spec, **self._idleness, **unused, health=HealthOf(self._health_of))))
 
@@ -240,8 +243,8 @@ class RosNodes(Manager):
             text = f"{name}: another node of {self.registrar.name} has this name already, resource {other}"
             raise NameTaken(f"{text}: expected a name that no other node has", name=name)
 
-    def _before(self, graph: NodeGraph, name: str, *, is_first: bool) -> frozenset[str]:
-        """Return the instances of a name that are not the node that is going to start.
+    def _before(self, graph: NodeGraph, name: str, *, is_first: bool) -> tuple[frozenset[str], frozenset[str]]:
+        """Return the instances of a name before its node is started, and those of them that have ended.
 
         Raises:
             NameTaken: one of them is a node that runs. `.name`
@@ -249,13 +252,12 @@ class RosNodes(Manager):
         time.sleep(max(0.0, self._sees_from - time.monotonic()))  # a load that comes just after the start
         there = graph.instances(name)
         with self._lock:
-            ended = self._gone[name] = self._gone.get(name, frozenset()) & there
-        if not is_first:  # what is there may be the program that the attempt before has started
-            return ended
-        if there - ended:
+            gone = self._gone[name] = self._gone.get(name, frozenset()) & there
+        if is_first and there - gone:  # later, it may be the program that the attempt before has started
             text = f"{name}: a node of this name is in the graph already, and {self.registrar.name} has not started it"
-            raise NameTaken(f"{text}: expected a name that no other node has; end that node, or rename this", name=name)
-        return there
+            what_next = "end that node, or rename this; if it was killed, it is there for some 20 s more"
+            raise NameTaken(f"{text}: expected a name that no other node has; {what_next}", name=name)
+        return there, gone
 
     def _seen(
         self, graph: NodeGraph, request: RunNode, part: Query, before: frozenset[str], check: Callable[[], object]
@@ -305,7 +307,7 @@ class RosNodes(Manager):
 
     def _call_lost(self, part: Query, message: str) -> None:
         try:
-            programs = registrar_in(self._node, part.registrar, patient=True, owner=self)
+            programs = registrar_in(self._rr_node, part.registrar, patient=True, owner=self)
             programs.send_status(part.resource_id, Status(State.FATAL, message))
             part.wait_status(State.FATAL, timeout_s=_END_S)
         except UnknownQuery:
