@@ -43,7 +43,7 @@ class Bridge(RosBridge):
     """
 
     def _join(self, node: str) -> RosGraph:
-        return Ros2Graph(node, self._failed)
+        return Ros2Graph(node, self._rr_failed)
 
 
 class Nodes(RosNodes):
@@ -58,4 +58,4 @@ class Nodes(RosNodes):
     """
 
     def _join(self, node: str) -> NodeGraph:
-        return Ros2Graph(node, self._failed)
+        return Ros2Graph(node, self._rr_failed)
