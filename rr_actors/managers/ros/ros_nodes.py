@@ -213,9 +213,9 @@ class RosNodes(Manager):
         running = self._running.get(resource_id)
         return None if running is None or running.lifecycle is None else running.request.health
 
-    async def _after_stop(self, final: bool) -> None:
+    async def _rr_after_stop(self, final: bool) -> None:
         """Leave the graph, however this manager ends. What ends its nodes at the last stop is done before."""
-        await super()._after_stop(final)
+        await super()._rr_after_stop(final)
         with self._lock:
             graph, self._graph = self._graph, None
         if graph is not None:
@@ -300,7 +300,7 @@ class RosNodes(Manager):
                 raise NodeFailed("its program has ended")
 
         try:
-            limit_s = min(request.timeout_s, _LAST_S) if self._final else request.timeout_s
+            limit_s = min(request.timeout_s, _LAST_S) if self._rr_final else request.timeout_s
             bring(request.full_name, lifecycle, goal, limit_s, check)
         except RrError as error:
             logger.warning("%s: ended without being %s: %s", self.registrar.name, goal, text_of(error))
