@@ -575,10 +575,10 @@ def test_of_many_loads_unloads_messages_and_timers_one_is_inside_at_a_time(
     system = start(rr.ChildSpec(Counter, id="counter", placement=placement))
     app, counter = system.open_registrar("app"), system.ref("counter")
     limit_s = 20 * LIMIT_S
-    counter.tell(("timers", count))
     done = 0
     while done < count:
         some = range(done, min(done + 250, count))
+        counter.tell(("timers", len(some)))  # in portions: all at once would be more than the mailbox takes
         for _ in some:
             counter.tell("message")
         with app.load_all(
