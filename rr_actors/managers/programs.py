@@ -262,7 +262,7 @@ class Programs(Manager):
 
     @run_program.resume
     def resume_program(self, request: RunProgram, response: Program) -> None:
-        """Let it go on."""
+        """Have it go on."""
         self._external.resume(current().resource_id)
         if (check := self._checks.get(current().resource_id)) is not None:
             check.begin_anew()

@@ -123,7 +123,7 @@ class ResourceRow(msgspec.Struct, frozen=True):
         part_resources: the ids of the resources that those are on, of those that are loaded.
         title: of the request; "" if its server gives none.
         priority: the highest of its holders; None: all have it on standby, or nobody holds it.
-        revoked: its holders are letting it go, because its owner has revoked it, or one of its parts is revoked.
+        revoked: its holders are to release it, because its owner has revoked it, or one of its parts is revoked.
     """
 
     id: str

@@ -221,8 +221,8 @@ def test_a_host_that_is_back_with_an_empty_state_directory_leaves_nothing_held(t
 CLIENT = CONSUMER.replace("system.open_registrar", "rr.connect(sys.argv[1]).open_registrar")
 
 
-def test_a_client_that_was_killed_while_the_other_host_is_away_owes_what_it_held_there(tmp_path: Path) -> None:
-    """Its catalog keeps that, as the other host cannot see that the client is gone."""
+def test_a_connected_program_killed_while_the_other_host_is_away_owes_what_it_held_there(tmp_path: Path) -> None:
+    """Its catalog keeps that, as the other host cannot see that the program is gone."""
     listen = endpoint()
     with cameras_at(tmp_path / "b", listen, "keep") as b:
         command = [sys.executable, "-c", CLIENT, tmp_path / "a", listen]
@@ -230,12 +230,12 @@ def test_a_client_that_was_killed_while_the_other_host_is_away_owes_what_it_held
             assert other.stdout is not None
             assert other.stdout.readline() == b"loaded\n"
             other.kill()
-        assert holders(b) == ["hosta/client.app"]
+        assert holders(b) == ["hosta/connection.app"]
         with consumer_at(tmp_path / "a", endpoint()):
             pass  # hostb is not reached
         found = run_cli("check", tmp_path / "a")
         assert found.returncode == 0, found.stdout + found.stderr
-        assert holders(b) == ["hosta/client.app"]
+        assert holders(b) == ["hosta/connection.app"]
         with consumer_at(tmp_path / "a", listen) as a:
             until(lambda: a.hosts()[0].state == "up", "hostb is there", LIMIT_S)
             until(lambda: holders(b) == [], "it is released", LIMIT_S)

@@ -314,7 +314,7 @@ def _keep(decision: Decision, resource: Resource, failure: Failure) -> None:
     decision.cause(Happened("unload_failed", resource, failure.message, kept=True))
     for query in decision.catalog.queries_of(resource.id):
         if decision.forget(decision.catalog.unanswered, query.id):  # else its Unload comes again, for a second try
-            remember(decision, query.id, failure)  # its holder does not let it go any more
+            remember(decision, query.id, failure)  # its holder does not release it any more
             decision.cause(SendReply(query.origin, UnloadRefused(query.id, failure)))
         send_notices(decision, query)  # the holder passed them over while it was releasing the query
     decision.effects += answers_to_owners(decision, resource, failure)

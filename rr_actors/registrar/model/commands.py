@@ -242,7 +242,7 @@ class Revoke(Command, frozen=True):
 
 
 class GraceOver(Command, frozen=True):
-    """The time is over in which a revoked resource's holders could let it go."""
+    """The time is over in which a revoked resource's holders could release it."""
 
     resource_id: str
     event: str

@@ -168,7 +168,7 @@ class Notice(msgspec.Struct, frozen=True, array_like=True, gc=False):
 
 
 REVOKED = "revoked"
-"""Notice.reason of a resource whose holders are to let it go."""
+"""Notice.reason of a resource whose holders are to release it."""
 
 
 def is_revocation(notice: Notice) -> bool:
