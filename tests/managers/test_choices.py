@@ -432,14 +432,18 @@ def test_what_is_lost_again_and_again_waits_longer_each_time_and_the_holders_hea
     world = World(start, [sensor("camera"), sensor("lidar")])
     choice = world.choose()
     warned = "as it has failed repeatedly"
-    while sum(warned in status.message for status in world.heard) < 3:
+
+    def waits() -> list[float]:
+        said = [status.message for status in world.heard if warned in status.message]
+        return [float(message.split(" in ")[1].split(" s,")[0]) for message in said]
+
+    while len(set(waits())) < 2:  # on a slow machine an alternative is well for so long that it begins again
         world.say(choice.response.server.removeprefix("sensors/"), "FATAL")
         seen = choice.response.server
         eventually(lambda: choice.response.server != seen, LIMIT_S)  # noqa: B023
-    waits = [status.message.split(" in ")[1].split(" s,")[0] for status in world.heard if warned in status.message]
     assert len(world.steps.items) < 30
     assert all(status.state is rr.State.WARNING for status in world.heard if warned in status.message)
-    assert max(map(float, waits)) > min(map(float, waits))
+    assert waits()[-1] > waits()[0]
 
 
 RINGS = {

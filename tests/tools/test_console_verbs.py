@@ -1421,7 +1421,7 @@ def test_nothing_that_users_write_controls_the_terminal(app: rr.Registrar, shop:
         rr_actors("load", "evil/thing", '"fails"'),
         rr_actors("check", tmp_path / HOSTILE),
         rr_actors("start", tmp_path / HOSTILE),
-        rr_actors("sequence", tmp_path / HOSTILE, query.id, "--seconds", "0"),
+        rr_actors("sequence", tmp_path / HOSTILE, query.id, "--seconds", "0.2"),
         rr_actors("inspect", shop.state_dir),
         rr_actors("tree", shop.state_dir),
     ]
