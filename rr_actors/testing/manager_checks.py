@@ -52,6 +52,7 @@ _LINES = 12  # a callback has seldom more
 _SCENARIOS_WITHOUT_KILLS = 20
 _PER_KILL = 20  # scenarios: many are like others, or have no kill that strikes
 _SKIPPED = 10
+_FIRST_KILLS = 4  # scenarios of each kind of step in which a kill may be, before all others: chance may leave one out
 _MEETINGS = 6  # scenarios in which load callbacks run at the same time, before all others
 _SHOW_S = 1.0
 _REFUSED_ALL = 12
@@ -154,6 +155,8 @@ def check_manager(
         scenarios = _scenarios(strategies, refused, stage.servers, with_kills=kills > 0, serial=serial)
         if not serial:
             search.run(_together(strategies), seed, _MEETINGS, only=RACES)
+        for each in _with_one_kill(strategies, stage.servers) if kills else ():
+            search.run(each, seed, _FIRST_KILLS)
         search.run(scenarios, seed, _PER_KILL * kills or _SCENARIOS_WITHOUT_KILLS)
         return search.result()
 
@@ -308,6 +311,29 @@ def _together(requests: Mapping[str, SearchStrategy[Any]]) -> SearchStrategy[lis
 
     loads = [st.builds(LoadTogether, st.just(server), of.map(tuple)) for server, of in some.items()]
     return st.one_of(loads).map(alone)
+
+
+def _with_one_kill(
+    requests: Mapping[str, SearchStrategy[Any]], servers: Mapping[str, ServerFacts]
+) -> list[SearchStrategy[list[Step]]]:
+    """Return strategies of a load and a step that kills, one for each kind of step."""
+    from hypothesis import strategies as st
+
+    line, which = st.integers(0, _LINES // 3), st.just(0)
+    roles = {role for server in requests for role in servers[server].roles}
+    load = st.one_of([st.builds(Load, st.just(server), of) for server, of in requests.items()])
+    killed = st.one_of([st.builds(Load, st.just(server), of, st.none() | line) for server, of in requests.items()])
+    steps: list[tuple[type[Step], SearchStrategy[Step]]] = [
+        (Unload, st.builds(Unload, which, line)),
+        (Kill, st.builds(Kill)),
+        (Kill, st.builds(Kill, line)),
+        (SendStatus, st.builds(SendStatus, which, st.just("WARNING"), line)),
+        (Pause, st.builds(Pause, which, line)),
+        (AskUsage, st.builds(AskUsage, line)),
+    ]
+    kills = [step for kind, step in steps if kind.role in roles or kind is Kill]
+    some = [st.builds(_without_none, load, st.lists(st.none() | step, min_size=1, max_size=1)) for step in kills]
+    return [st.builds(_without_none, killed, st.just(list[Step | None]())), *some]
 
 
 def _without_none(first: Step | None, more: list[Step | None]) -> list[Step]:
