@@ -210,6 +210,32 @@ class Serial(rr.Manager, serial=True):
         return self.most
 
 
+class Ends(rr.Manager):
+    """It ends by any message. What it has loaded is loaded again."""
+
+    @rr.server("thing", recovery="reload")
+    def load_thing(self, name: str) -> str:
+        return name
+
+    def on_receive(self, message: str) -> None:
+        raise RuntimeError(message)
+
+
+def test_a_manager_does_not_wait_in_its_start_for_reloads_that_begin_after_it(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rr_actors.registrar.engine.node._RECOVER_S", 3600.0)  # it waits so long for recover callbacks
+    system = start(rr.ChildSpec(Ends, id="ends", placement="thread"))
+    app = system.open_registrar("app")
+    query = app.load("ends/thing", "cup")
+    child = system.ref("ends")
+    watch = rr.monitor(child)
+    child.tell("end")
+    assert watch.wait(LIMIT_S).reason != "normal"
+    child.wait_running(LIMIT_S)
+    assert app.load("ends/thing", "cup", timeout_s=LIMIT_S).resource_id == query.resource_id
+
+
 def test_the_callbacks_of_reloads_of_a_serial_manager_run_one_at_a_time(start: Start) -> None:
     system = start(rr.ChildSpec(Serial, id="things", placement="thread"))
     app, things = system.open_registrar("app"), system.registrar("things")

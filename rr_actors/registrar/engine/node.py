@@ -191,9 +191,16 @@ class Node(ProcessNode):
             raise
 
     async def settle(self, registrar: RegistrarActor) -> None:
-        """Wait at most 2 s for the recover callbacks to end, and at most 1 s for the lists of providers that are up."""
+        """Wait at most 2 s for the recover callbacks to end, and at most 1 s for the lists of providers that are up.
+
+        Reloads begin when on_start has returned, so they are not waited for.
+        """
         deadline = time.monotonic() + _RECOVER_S
-        while registrar.catalog.recovering and not registrar.closed and time.monotonic() < deadline:
+        while not registrar.closed and time.monotonic() < deadline:
+            with registrar.lock:
+                catalog = registrar.whole()
+                if catalog.recovering.keys() <= catalog.early.keys():
+                    break
             await registrar.next_change(_LOOK_AGAIN_S)
         deadline = time.monotonic() + _RECONCILE_S
         while time.monotonic() < deadline and not registrar.closed:
