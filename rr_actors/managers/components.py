@@ -164,7 +164,7 @@ class Components(Manager):
     def _read(self) -> list[ComponentDescription]:
         return read_registry(self._path, self._rr_beginning())
 
-    @server("component")
+    @server("component", recovery="keep")
     def load_component(self, request: LoadComponent) -> Component:
         """Run the most reliable component of the type whose program can be run."""
         candidates, search = self.candidates(request.type), self._search()

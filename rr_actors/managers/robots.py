@@ -116,7 +116,7 @@ class Robots(Manager):
         """Wait for no part that has failed any more."""
         self._retries.stop()
 
-    @server("robot")
+    @server("robot", recovery="keep")
     def load_robot(self, request: LoadRobot) -> Robot:
         """Load every part of the robot, the driver first."""
         orders = self._orders(request)

@@ -84,7 +84,7 @@ class Pipes(Components):
         self._pipes: list[PipeDescription] = file.pipe
         return [*file.component]
 
-    @server("pipe")
+    @server("pipe", recovery="keep")
     def load_pipe(self, request: Pipe) -> BuiltPipe:
         """Run the best chain of components that can be run, from the first segment to the last."""
         return self._built(request, self._build(request, self._goal(request.of_type)))
