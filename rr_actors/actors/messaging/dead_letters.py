@@ -57,7 +57,12 @@ class DeadLetter(msgspec.Struct, frozen=True):
 
 
 class DeadLetters(msgspec.Struct, frozen=True):
-    """The number of dead letters, and the newest of them, oldest first."""
+    """The dead letters of a system or a process.
+
+    Attributes:
+        count: their number.
+        letters: the newest of them, oldest first.
+    """
 
     count: int
     letters: list[DeadLetter]
