@@ -206,7 +206,8 @@ def test_each_field_of_a_query_row_reaches_a_connection(system: rr.System, conne
     (row,) = worker.queries()
 
     assert asdict(row) == heard, "a new field of QueryRow: what does a connection hear of it?"
-    whole = QueryRow(**heard | {"parent": "abcd", "said": "50% opening", "title": "the front camera"})
+    heard |= {"parent": "abcd", "said": "50% opening", "title": "the front camera"}
+    whole = QueryRow(**heard)
     assert across(QueryPage(1, [whole])).rows == [whole]
 
 
