@@ -10,6 +10,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Generic, Protocol, Self
 
 import msgspec
@@ -149,36 +150,27 @@ class Query(Generic[Response]):
 
     The response of a ``Query[Feed]`` is a Feed; the response of a plain Query has any type. Queries with the same id
     are equal, also in lists and in other processes.
-
-    Attributes:
-        id: UUIDv7, 32 hex digits, made by the holder; UUIDv8 of what a planner loads for itself.
-        resource_id: the id of the resource, the same for all its holders.
-        origin: the registrar that holds the query.
-        registrar, server: the registrar and the server that serve the resource.
-        parent: the id of the holder's own resource that depends on it; "" for none.
-        state: the state of the last status; OK at first.
-        released: whether the provider has taken the resource away; after a revocation, when the query is released.
     """
 
     __slots__ = (
         "_all_streams",
         "_codec",
         "_holder",
+        "_id",
         "_is_released",
         "_is_revoked",
+        "_origin",
+        "_parent",
+        "_registrar",
+        "_released",
         "_request",
+        "_resource_id",
         "_response",
+        "_server",
+        "_state",
         "_statuses",
         "_types",
         "_waiters",
-        "id",
-        "origin",
-        "parent",
-        "registrar",
-        "released",
-        "resource_id",
-        "server",
-        "state",
     )
 
     def __init__(
@@ -192,13 +184,13 @@ class Query(Generic[Response]):
         types: Callable[[str], tuple[Codec, Codec]],
         all_streams: AllStreams,
     ) -> None:
-        self.id = id
-        self.resource_id = ""
-        self.origin = origin
-        self.registrar, self.server = place
-        self.parent = parent
-        self.state = OK
-        self.released = False
+        self._id = id
+        self._resource_id = ""
+        self._origin = origin
+        self._registrar, self._server = place
+        self._parent = parent
+        self._state = OK
+        self._released = False
         self._holder = holder
         self._codec: Codec | None = None  # of the response type that the load was given
         self._is_released = False
@@ -211,9 +203,49 @@ class Query(Generic[Response]):
         self._statuses: _Statuses | None = None  # made for the first: most queries hear of none
 
     @property
+    def id(self) -> str:
+        """The id of the query: UUIDv7, 32 hex digits, made by the holder; UUIDv8 of what a planner loads for itself."""
+        return self._id
+
+    @property
+    def resource_id(self) -> str:
+        """The id of the resource, the same for all its holders."""
+        return self._resource_id
+
+    @property
+    def origin(self) -> str:
+        """The registrar that holds the query."""
+        return self._origin
+
+    @property
+    def registrar(self) -> str:
+        """The registrar that serves the resource."""
+        return self._registrar
+
+    @property
+    def server(self) -> str:
+        """The server that serves the resource, its name at its registrar."""
+        return self._server
+
+    @property
+    def parent(self) -> str:
+        """The id of the holder's own resource that depends on it; "" for none."""
+        return self._parent
+
+    @property
+    def state(self) -> State:
+        """The state of the last status; OK at first."""
+        return self._state
+
+    @property
+    def released(self) -> bool:
+        """Whether the provider has taken the resource away; after a revocation, when the query is released."""
+        return self._released
+
+    @property
     def server_id(self) -> str:
         """The id of the server, "registrar/server"."""
-        return f"{self.registrar}/{self.server}"
+        return f"{self._registrar}/{self._server}"
 
     @property
     def request(self) -> Any:
@@ -308,7 +340,7 @@ class Query(Generic[Response]):
 
     def _at_holder(self) -> Holder:
         if self._holder is None:
-            raise UnknownQuery(f"query {self.id}: another process holds it; unload it there", query_id=self.id)
+            raise UnknownQuery(f"query {self._id}: another process holds it; unload it there", query_id=self._id)
         return self._holder
 
     def wait_status(self, state: State | str | None = None, timeout_s: float | None = None) -> Status:
@@ -338,7 +370,7 @@ class Query(Generic[Response]):
                     has_come = flag.wait(left_s)
                 if not has_come and left_s is not None and left_s <= 0:
                     what = "status" if wanted is None else f"status {wanted}"
-                    text = f"{self.server_id}: no {what} within {limit_s:g} s; the last state is {self.state}"
+                    text = f"{self.server_id}: no {what} within {limit_s:g} s; the last state is {self._state}"
                     raise LoadTimeout(text, server=self.server_id, timeout_s=limit_s)
             finally:
                 self._unwatch(flag)
@@ -374,10 +406,10 @@ class Query(Generic[Response]):
         limit_s = time_limit(timeout_s)
         self._at_holder()
         if self._is_released:
-            raise UnknownQuery(f"{self.server_id}: query {self.id} is released: it has no streams", query_id=self.id)
+            raise UnknownQuery(f"{self.server_id}: query {self._id} is released: it has no streams", query_id=self._id)
         source = Source(
-            self.resource_id,
-            self.origin,
+            self._resource_id,
+            self._origin,
             self._is_over,
             self._named_streams,
             self._watch,
@@ -402,15 +434,15 @@ class Query(Generic[Response]):
 
     def _is_over(self) -> bool:
         """Return whether the query is released; raise ResourceLost if the resource is lost."""
-        if self.released or self.state is State.FATAL:
-            text = f"{self.server_id}: resource {self.resource_id} is lost"
-            raise ResourceLost(text, query_id=self.id, resource_id=self.resource_id)
+        if self._released or self._state is State.FATAL:
+            text = f"{self.server_id}: resource {self._resource_id} is lost"
+            raise ResourceLost(text, query_id=self._id, resource_id=self._resource_id)
         return self._is_released
 
     def _silence(self) -> RrError:
         """Return the error that says why no status will come any more."""
-        text = f"no status of query {self.id} will come: it is released, or another process holds it"
-        return UnknownQuery(f"{self.server_id}: {text}", query_id=self.id)
+        text = f"no status of query {self._id} will come: it is released, or another process holds it"
+        return UnknownQuery(f"{self.server_id}: {text}", query_id=self._id)
 
     def _when_over(self, call: Callable[[], object]) -> None:
         """Call `call` once, from any thread, when the query is not held any more; at once if it is not."""
@@ -422,7 +454,7 @@ class Query(Generic[Response]):
         statuses = self._statuses or _Statuses()
         if statuses.missed:
             text = "%s: wait_status() misses %d statuses of query %s: the newest %d are kept"
-            logger.warning(text, self.server_id, statuses.missed, self.id, _KEPT_STATUSES)
+            logger.warning(text, self.server_id, statuses.missed, self._id, _KEPT_STATUSES)
             statuses.missed = 0
         for status in list(statuses):
             if wanted is None or status.state is wanted:
@@ -433,10 +465,10 @@ class Query(Generic[Response]):
 
     def _hear(self, status: Status, response: bytes | None, *, released: bool) -> None:
         """Note a status that has arrived, and wake the threads that wait for one. On the loop."""
-        self.state = State.FATAL if self.state is State.FATAL else status.state
+        self._state = State.FATAL if self._state is State.FATAL else status.state
         if response is not None:
             self._response = _Bytes(response)
-        self.released = self.released or released
+        self._released = self._released or released
         self._is_revoked = self._is_revoked or status.reason == REVOKED
         if self._statuses is None:
             self._statuses = _Statuses()
@@ -446,7 +478,7 @@ class Query(Generic[Response]):
     def _end(self) -> None:
         """Note that the query is not held any more, and wake the threads that wait for a status. On the loop."""
         self._is_released = True
-        self.released = self.released or self._is_revoked
+        self._released = self._released or self._is_revoked
         self._wake()
 
     def _wake(self) -> None:
@@ -455,16 +487,16 @@ class Query(Generic[Response]):
 
     def _loaded(self, held: Held) -> None:
         """Note that the load has succeeded, with the values of its row. On the loop."""
-        self.resource_id = held.resource_id
-        self.state = held.state
+        self._resource_id = held.resource_id
+        self._state = held.state
         if held.response is not None:
             self._response = _Bytes(held.response)
 
     def _loaded_directly(self, resource_id: str, response: bytes, state: State) -> None:
         """Note that the load has succeeded. In the thread that loads."""
-        self.resource_id = resource_id
-        if state is not OK and self.state is OK:  # otherwise a status arrived before the answer
-            self.state = state
+        self._resource_id = resource_id
+        if state is not OK and self._state is OK:  # otherwise a status arrived before the answer
+            self._state = state
         if self._response is None:  # otherwise an update arrived before the answer
             self._response = _Bytes(response)
 
@@ -475,7 +507,7 @@ class Query(Generic[Response]):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         for name, value in state.items():
-            setattr(self, name, value)
+            setattr(self, name if name.startswith("_") else f"_{name}", value)
         self._holder = self._codec = self._waiters = self._statuses = None
         self._is_released = self._is_revoked = False
         self._types, self._all_streams = _no_types, _not_known
@@ -562,25 +594,30 @@ class Query(Generic[Response]):
 
     def _is_gone(self) -> bool:
         """Return whether the query is released already, by its holder or its provider."""
-        return self.released or self._is_released
+        return self._released or self._is_released
 
     def __eq__(self, other: object) -> bool:
-        return self.id == other.id if isinstance(other, Query) else NotImplemented
+        return self._id == other._id if isinstance(other, Query) else NotImplemented
 
     def __hash__(self) -> int:
-        return hash(self.id)
+        return hash(self._id)
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         def rows() -> str:
-            facts = [("query", self.id), ("held by", self.origin), ("server", self.server_id)]
-            facts += [("request", shown(self.request)), ("response", shown(self.response)), ("state", str(self.state))]
-            facts += [("resource", self.resource_id), ("for", self.parent or "itself")]
-            return table(("", ""), [*facts, *([("released", "by its provider")] if self.released else [])])
+            facts = [("query", self._id), ("held by", self._origin), ("server", self.server_id)]
+            facts += [("request", shown(self.request)), ("response", shown(self.response)), ("state", str(self._state))]
+            facts += [("resource", self._resource_id), ("for", self._parent or "itself")]
+            return table(("", ""), [*facts, *([("released", "by its provider")] if self._released else [])])
 
         return bundle_or_text(repr(self), rows)
 
     def __repr__(self) -> str:
-        return f"<Query {self.id} of {self.origin} on {self.server_id}, {self.state}>"
+        return f"<Query {self._id} of {self._origin} on {self.server_id}, {self._state}>"
+
+
+for _name in ("id", "resource_id", "origin", "registrar", "server", "parent", "state", "released"):
+    # A load reads them nine times. So that no read is a call of Python, the slot itself is read.
+    setattr(Query, _name, property(attrgetter(f"_{_name}"), doc=vars(Query)[_name].__doc__))
 
 
 # For the package's own modules. As private methods they stay out of an editor's list of names.
@@ -846,7 +883,7 @@ class Views:
                     return None
                 if query_id in catalog.ending:  # the status callback of its whole hears that it was taken away
                     view = self.seen(held)
-                    view.released = True
+                    view._released = True  # pyright: ignore[reportPrivateUsage]  # same file
                     end(view)
                 else:
                     view = self.of(held)

@@ -72,6 +72,8 @@ class Child(NamedTuple):
     """A child, as which_children() lists it.
 
     Attributes:
+        id: its id, the last part of its path.
+        type: "supervisor" or "worker".
         ref: a reference that works whenever the child is running.
         state: "running", "restarting" (also during a backoff), "stopped", or "starting" during its first start.
         pid: the process in which the child runs; None while it does not. A child that has answered a load has one, also

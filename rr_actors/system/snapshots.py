@@ -246,7 +246,8 @@ class Preview(msgspec.Struct, frozen=True):
     says it in words.
 
     Attributes:
-        what: "kill", "stop" or "restart"; `path`: of which child.
+        what: "kill", "stop" or "restart".
+        path: of which child.
         supervisors: what each supervisor would do that acts, from the child's own upwards.
         ends: whether the system would end.
         resources: of which something would become; also those that depend on one that is lost.

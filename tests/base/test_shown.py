@@ -13,7 +13,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.base.errors import counted, shown
-from rr_actors.base.names import named
+from rr_actors.base.names import NAME_LIMIT, NAME_WIDTH, named
 from rr_actors.registrar.core.decide import decide
 from rr_actors.registrar.model.catalog import Catalog
 
@@ -156,3 +156,18 @@ def test_a_name_is_not_shortened_to_save_a_few_characters() -> None:
 )
 def test_a_count_has_the_noun_in_the_form_for_it(count: int, noun: str, expected: str) -> None:
     assert counted(count, noun) == expected
+
+
+@pytest.mark.parametrize("width", [NAME_WIDTH, NAME_LIMIT])
+def test_a_name_that_is_longer_by_few_characters_is_not_cut(width: int) -> None:
+    server = "cameras/camera"
+
+    def of_length(length: int) -> str:
+        return "r" * (length - len(server) - 1)
+
+    for more in range(-1, 16):
+        request = of_length(width + more)
+        assert named(server, request, width) == f"{server} {request}"
+    short = named(server, of_length(width + 16), width)
+    assert len(short) == width
+    assert "…" in short

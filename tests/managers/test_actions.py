@@ -320,6 +320,23 @@ def test_a_graph_can_be_stopped_paused_and_resumed_by_messages(robot: Robot, tmp
             robot.messages.stop_graph(id).get()
 
 
+def test_a_graph_can_be_paused_resumed_and_stopped_by_a_connected_program(robot: Robot, tmp_path: Path) -> None:
+    with (
+        rr.connect(robot.system.state_dir) as connection,
+        robot.app.load("actions/graph", RunGraph(lingering(tmp_path))) as query,
+    ):
+        actions = connection.proxy("actions")
+        actions.pause_graph(query.resource_id).get(timeout=30)
+        assert eventually(lambda: query.response["graph_state"] == "PAUSED")
+        actions.resume_graph(query.resource_id).get(timeout=30)
+        assert eventually(lambda: query.response["graph_state"] == "RUNNING")
+        actions.stop_graph(query.resource_id).get(timeout=30)
+        (tmp_path / "go").touch()
+        assert eventually(lambda: query.response["graph_state"] == "STOPPED")
+        with pytest.raises(rr.NotFound, match="no graph 'x'"):
+            actions.stop_graph("x").get(timeout=30)
+
+
 def test_what_is_said_to_a_graph_as_soon_as_it_is_loaded_is_not_lost(robot: Robot, tmp_path: Path) -> None:
     with robot.app.load("actions/graph", RunGraph(lingering(tmp_path))) as query:
         robot.messages.pause_graph(query.resource_id).get()

@@ -164,6 +164,18 @@ def test_a_callback_that_clean_restarts_interrupt_is_not_to_blame_and_runs_again
     assert not [record.message for record in caplog.records if "died" in record.message]
 
 
+def test_the_log_says_that_a_death_in_a_callback_is_taken_off_the_count(
+    start: Start, workshop: Workshop, caplog: pytest.LogCaptureFixture
+) -> None:
+    system = start(deadly(workshop, "os._exit"))
+    workshop.note("armed")
+    with pytest.raises(rr.LoadFailed):
+        system.open_registrar("app").load("shop/thing", "load", timeout_s=STARTS_S)
+    said = [one.getMessage() for one in caplog.records if "is taken off the count again" in one.getMessage()]
+    assert said
+    assert all("the last process of root/shop died" in line and "thing" in line for line in said)
+
+
 @pytest.mark.parametrize("how", ENDS)
 def test_a_recover_callback_that_ends_its_process_three_times_loses_the_resource_by_name(
     start: Start, workshop: Workshop, how: str

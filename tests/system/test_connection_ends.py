@@ -11,12 +11,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec.structs import asdict
 
 import rr_actors as rr
 from rr_actors.base.errors import UnknownQuery, UnknownRegistrar
+from rr_actors.base.values.failure import Failure, error_of, failure_of
+from rr_actors.registrar.pages import QueryRow
 from rr_actors.registrar.queries import Status
+from rr_actors.streams.stream import ReaderRow, StreamInfo, StreamRow
 from rr_actors.system.console.connected_queries import status_heard
-from rr_actors.system.console.console_messages import Heard
+from rr_actors.system.console.console_messages import ANSWER_LIMIT_BYTES, Heard, Message, QueryPage, Refused, Streams
+from rr_actors.system.console.console_protocol import ANSWERS, decoder_of
+from rr_actors.wire.frames import FrameReader, framed
 from support import LIMIT_S, Calls, eventually, kill, wait_respawned
 
 pytestmark = pytest.mark.usefixtures("runtime_dir")
@@ -179,6 +185,60 @@ def test_each_field_of_a_status_reaches_a_connection() -> None:
     assert of_status | {"response", "released"} == set(Heard.__struct_fields__)
     status = status_heard(Heard(**values))
     assert {name: getattr(status, name) for name in of_status} == values
+
+
+def across(message: Message) -> Any:
+    """What a connected program reads of an answer of the system."""
+    (read,) = FrameReader(decoder_of(ANSWERS), ANSWER_LIMIT_BYTES).feed(bytes(framed(message, ANSWER_LIMIT_BYTES)))
+    return read
+
+
+def test_each_field_of_a_query_row_reaches_a_connection(system: rr.System, connection: rr.Connection) -> None:
+    worker = connection.open_registrar("w")
+    query = worker.load("cameras/camera", "front", priority=5)
+    system.registrar("cameras").send_status(query.resource_id, rr.Status("WARNING", "dirty"))
+    eventually(lambda: query.state == "WARNING")
+    heard: dict[str, Any] = {
+        "id": query.id, "origin": worker.name, "server": "cameras/camera", "resource_id": query.resource_id,
+        "parent": "", "request": '"front"', "hold": "held", "state": "WARNING", "priority": 5, "said": "", "title": "",
+    }  # fmt: skip
+
+    (row,) = worker.queries()
+
+    assert asdict(row) == heard, "a new field of QueryRow: what does a connection hear of it?"
+    heard |= {"parent": "abcd", "said": "50% opening", "title": "the front camera"}
+    whole = QueryRow(**heard)
+    assert across(QueryPage(1, [whole])).rows == [whole]
+
+
+def test_each_field_of_a_stream_row_reaches_a_connection() -> None:
+    info = {
+        "id": "r/images", "name": "images", "server": "cameras/camera", "resource_id": "r", "rate_hz": 29.5,
+        "bytes_per_s": 1e6, "consumers": 2, "missed": 3, "age_s": 0.25, "best_hz": 30.0,
+    }  # fmt: skip
+    reader = {"registrar": "app", "pid": 7, "keep": "all", "missed": 4}
+    row = {"info": StreamInfo(**info), "request": "1", "frames": 8, "readers": [ReaderRow(**reader)], "title": "front"}
+
+    for cls, values in ((StreamInfo, info), (ReaderRow, reader), (StreamRow, row)):
+        assert set(cls.__struct_fields__) == set(values), f"a new field of {cls.__name__}: does it reach a connection?"
+    (read,) = across(Streams(1, [StreamRow(**row)])).rows
+    assert asdict(read) == row
+    assert asdict(read.info) == info
+    assert asdict(read.readers[0]) == reader
+
+
+def test_each_field_of_a_failure_reaches_a_connection() -> None:
+    frames = (rr.Frame("arms/arm", "OSError: stuck"), rr.Frame("cameras/camera", "LoadFailed: no arm"))
+    details = {"server": "cameras/camera", "traceback": "Traceback: in arm.py", "known": ("a", "b"), "since": 2.5}
+    error = rr.LoadFailed("no arm", trace=frames, **details)
+
+    assert set(Failure.__struct_fields__) == {"kind", "message", "details", "trace"}
+    read = error_of(across(Refused(failure_of(error))).failure)
+    assert isinstance(read, rr.LoadFailed)
+
+    assert (str(read), read.details, read.trace) == ("no arm", error.details, frames)
+    assert {name: getattr(read, name) for name in details} == details
+    assert read.__notes__ == ["raised in arms/arm:\nTraceback: in arm.py"]
 
 
 # -- the end of the system ---------------------------------------------------------------------------------------------

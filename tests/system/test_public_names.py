@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import itertools
 import re
 import runpy
+import textwrap
+from functools import cached_property
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 import pytest
@@ -116,3 +121,39 @@ def _instances(system: rr.System) -> list[Any]:
         worker = connection.open_registrar(name)
         found += [connection, worker, worker.load(f"{name}/thing", 1)]
     return found
+
+
+def test_each_public_attribute_of_a_public_class_is_documented() -> None:
+    classes = [cls for cls in (getattr(rr, name) for name in rr.__all__) if isinstance(cls, type)]
+    owned = {(cls, name, owner_of(cls, name)) for cls in classes for name in shown(cls)}
+    ours = {one for one in owned if one[2].__module__.startswith("rr_actors.")}
+
+    assert len(ours) > 500
+    assert sorted(f"{cls.__name__}.{name}" for cls, name, owner in ours if not is_documented(cls, name, owner)) == []
+
+
+def owner_of(cls: type, name: str) -> type:
+    return next(base for base in cls.__mro__ if name in vars(base))
+
+
+def is_documented(cls: type, name: str, owner: type) -> bool:
+    """Whether a method or property has a docstring; or a field a text below it, or a line in a class's docstring."""
+    member = vars(owner)[name]
+    if isinstance(member, FunctionType | property | classmethod | staticmethod | cached_property):
+        return bool(inspect.getdoc(getattr(cls, name) if isinstance(member, classmethod) else member))
+    texts = [inspect.getdoc(base) or "" for base in cls.__mro__ if base.__module__.startswith("rr_actors.")]
+    line = rf"^ +([\w, ]+, )?{name}(, [\w, ]+)?:|`\.{name}`"
+    return any(re.search(line, text, re.MULTILINE) for text in texts) or name in texts_below_fields(owner)
+
+
+def texts_below_fields(cls: type) -> set[str]:
+    """The fields of a class that have a string below them in the source."""
+    (declared,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
+    assert isinstance(declared, ast.ClassDef)
+    return {
+        ast.unparse(field.target if isinstance(field, ast.AnnAssign) else field.targets[0])
+        for field, text in itertools.pairwise(declared.body)
+        if isinstance(field, ast.AnnAssign | ast.Assign)
+        and isinstance(text, ast.Expr)
+        and isinstance(text.value, ast.Constant)
+    }

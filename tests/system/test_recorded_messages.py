@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,8 @@ import pykka
 import pytest
 
 import rr_actors as rr
+from rr_actors.registrar.model.recorded import Entry
+from rr_actors.system.recording.sequence_diagrams import sequence_of
 from support import eventually
 
 Start = Callable[..., rr.System]
@@ -21,6 +24,8 @@ class Pong(rr.Actor):
     def on_receive(self, message: Any) -> Any:
         if message == "raise":
             raise ValueError("no number")
+        if message == "poison":
+            os._exit(3)
         return message + 1 if isinstance(message, int) else None
 
     def twice(self, value: int) -> int:
@@ -204,6 +209,55 @@ def test_a_message_to_a_dead_actor_is_an_arrow_that_ends_in_a_cross(start: Start
         wait_for(recording, "pong", expected=["root>pong Tell 1"])
         eventually(lambda: "dead_letter" in recording.messages("pong").sequence(), what="the dead letter")
         assert "did not arrive" in recording.messages("pong").sequence()
+
+
+@pytest.mark.parametrize("send", ["tell", "ask"])
+def test_a_message_that_ends_its_receiver_is_not_drawn_as_one_that_did_not_arrive(start: Start, send: str) -> None:
+    system = start(rr.ChildSpec(Pong, id="pong", restart="temporary"))
+    pong = system.ref("pong")
+
+    def is_refused() -> bool:
+        try:
+            pong.tell(1)
+        except pykka.ActorDeadError:
+            return True
+        return False
+
+    with system.record() as recording:
+        if send == "tell":
+            pong.tell("poison")
+        else:
+            with pytest.raises(pykka.ActorDeadError):
+                pong.ask("poison", timeout=30)
+        eventually(is_refused, what="its end")
+        wait_for(recording, "pong", expected=[f"root>pong {send.title()} 'poison'", "root>pong Tell 1"])
+        eventually(lambda: "dead_letter" in recording.messages("pong").sequence(), what="the dead letter")
+        drawn = recording.messages("pong").sequence().splitlines()
+
+    ends = [line.partition(" ms: ")[2] for line in drawn if "-x" in line]
+    assert ends[0] == f"{send.title()} 'poison' (no record of its arrival)"
+    assert ends[-1] == "Tell 1 (did not arrive)"
+
+
+def test_of_equal_messages_the_last_is_the_one_of_a_dead_letter() -> None:
+    def tell(at: float, text: str, pid: int = 1) -> Entry:
+        return Entry(at, "sent", registrar="app", peer="cam", name="Tell", query=f"{at}", detail=text, pid=pid)
+
+    def letter(at: float, text: str, pid: int = 1, why: str = "has ended") -> Entry:
+        return Entry(at, "dead_letter", registrar="cam", pid=pid, facts={"message": text, "why": why})
+
+    def undelivered(*entries: Entry) -> list[str]:
+        lines = sequence_of(entries).splitlines()
+        return [line.partition(": ")[2].removesuffix(" (did not arrive)") for line in lines if "did not" in line]
+
+    twice = tell(0, "1"), tell(1, "1")
+    assert undelivered(*twice) == []
+    assert undelivered(*twice, letter(2, "1")) == ["1000.0 ms: Tell 1"]
+    assert undelivered(*twice, letter(2, "1"), letter(3, "1")) == ["0.0 ms: Tell 1", "1000.0 ms: Tell 1"]
+    assert undelivered(*twice, letter(2, "<12 bytes>")) == ["1000.0 ms: Tell 1"]
+    assert undelivered(*twice, letter(2, "<12 bytes>", pid=2)) == []
+    assert undelivered(letter(0, "1"), tell(1, "1")) == []
+    assert undelivered(*twice, letter(2, "<12 bytes>", why="lost with its process at a.sock")) == []
 
 
 def test_messages_of_all_of_some_and_of_nobody(system: rr.System, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import os
 import re
 import shlex
 import signal
+import socket
 import subprocess
 import sys
 import tomllib
@@ -67,17 +68,31 @@ def test_the_application_of_a_new_project_runs_as_its_unit_says_and_stops_in_ord
     unit.read(project / "tea-robot.service")
     python, *arguments = shlex.split(unit["Service"]["ExecStart"])
     assert (Path(python).name, unit["Service"]["StateDirectory"]) == ("python", "tea-robot")
+    assert unit["Service"]["Type"] == "notify"
+    watchdog_us = int(unit["Service"]["WatchdogSec"]) * 1_000_000
+    manager = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    manager.bind(str(project / "notices"))
+    manager.settimeout(30.0)
     log = project / "log"
     with log.open("w") as out:
-        environment = os.environ | {"STATE_DIRECTORY": str(project / "state")}
+        environment = os.environ | {
+            "STATE_DIRECTORY": str(project / "state"),
+            "NOTIFY_SOCKET": str(project / "notices"),
+            "WATCHDOG_USEC": str(watchdog_us),
+        }
         service = subprocess.Popen([sys.executable, *arguments], cwd=project, env=environment, stdout=out, stderr=out)
     try:
         eventually(lambda: "has a map of the kitchen" in log.read_text(), 30.0, "the application's line")
         assert (project / "state" / "cameras").is_dir()
+        assert manager.recv(1000).startswith(b"READY=1\n")
+        assert manager.recv(1000) == b"WATCHDOG=1"
         eventually(lambda: has_handler(service.pid, signal.SIGTERM), what="run() handles SIGTERM")
         service.send_signal(signal.SIGTERM)
         assert service.wait(20) == 0
+        assert manager.recv(1000).startswith(b"STOPPING=1\n")
     finally:
+        manager.close()
+        (project / "notices").unlink()
         service.kill()
         service.wait()
     assert log.read_text().index("erases the map") < log.read_text().index("closes the camera")

@@ -73,7 +73,7 @@ def test_an_arrow_points_to_its_receiver_and_a_lost_message_has_a_cross() -> Non
     lines = sequence_text(
         "sequenceDiagram\n    participant p0 as root/app\n    participant p1 as root/camera\n"
         "    p0->>p1: 0.0 ms: Ask #quot;shoot#quot;\n    p1-->>p0: 1.5 ms: Answer 1\n"
-        "    p0-xp1: 2.0 ms: Tell 2 (did not arrive)\n    Note over p1: 3.0 ms: exited SIGKILL\n"
+        "    p0-xp1: 2.0 ms: Tell 2 (no record of its arrival)\n    Note over p1: 3.0 ms: exited SIGKILL\n"
         "    p0->>p0: 4.0 ms: Stop"
     ).splitlines()
 
@@ -81,7 +81,7 @@ def test_an_arrow_points_to_its_receiver_and_a_lost_message_has_a_cross() -> Non
         "             app    camera",
         '    0.0 ms     │──────>│     Ask "shoot"',
         "    1.5 ms     │<┄┄┄┄┄┄│     Answer 1",
-        "    2.0 ms     │──────✗│     Tell 2 (did not arrive)",
+        "    2.0 ms     │──────✗│     Tell 2 (no record of its arrival)",
         "    3.0 ms     │       ■     exited SIGKILL",
         "    4.0 ms     ↻       │     Stop",
     ]

@@ -270,7 +270,7 @@ def test_of_a_long_recording_of_many_children_what_is_in_sight_is_drawn(shown: C
     tab = shown(entries)
     drawn = tab.do(tab.page.evaluate("document.querySelectorAll('.rr-tl-plot .bar').length"))
     assert 0 < drawn < 10_000  # of 40,000: what is out of sight is not drawn
-    tab.sees(".rr-tl-subject", "1 lanes with less trouble are left out")
+    tab.sees(".rr-tl-subject", ", left out: 1 lane with less trouble")
 
 
 # -- on the page -----------------------------------------------------------------------------------------------------

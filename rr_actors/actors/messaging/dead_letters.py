@@ -30,6 +30,9 @@ KEPT = 1000
 LOG_EVERY_S = 5.0
 EVENTS_A_SECOND = 100
 
+LOST_WITH = "lost with its process at "
+"""Why a message is lost that was on its way when the receiver's process ended. The receiver may have begun with it."""
+
 
 class DeadLetter(msgspec.Struct, frozen=True):
     """A message that reached no actor.
@@ -54,7 +57,12 @@ class DeadLetter(msgspec.Struct, frozen=True):
 
 
 class DeadLetters(msgspec.Struct, frozen=True):
-    """The number of dead letters, and the newest of them, oldest first."""
+    """The dead letters of a system or a process.
+
+    Attributes:
+        count: their number.
+        letters: the newest of them, oldest first.
+    """
 
     count: int
     letters: list[DeadLetter]

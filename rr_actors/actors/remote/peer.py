@@ -366,7 +366,7 @@ class Line:
         for call in calls:
             self.cut_off(call, reason)
         for urn, letters in untold.items():
-            _record_lost(urn, letters, f"lost with its process at {self.address}")
+            _record_lost(urn, letters, f"{dead_letters.LOST_WITH}{self.address}")
 
     def cut_off(self, call: PendingCall, reason: Exception | None) -> None:
         """Fail a call whose link or connection is lost. From any thread."""

@@ -73,10 +73,14 @@ class StopEvent(threading.Event):
 class AskedHere(Protocol):
     """The query that a thread is about to load."""
 
-    id: str
-    registrar: str
-    server: str
-    parent: str
+    @property
+    def id(self) -> str: ...
+    @property
+    def registrar(self) -> str: ...
+    @property
+    def server(self) -> str: ...
+    @property
+    def parent(self) -> str: ...
 
 
 class RegistrarState(TurnActor):

@@ -19,6 +19,8 @@ from rr_actors.registrar.model.rows import shown_priority
 
 DECIDED = "decided"
 """The event of an entry that has a note about a decision, or a part of one (registrar/decisions)."""
+DEAD_LETTER = "dead_letter"
+"""The event of a message that reached no actor. Its registrar is that actor."""
 _LONG = 1000  # the bytes of a request that is shown, at most
 _PUT_BACK_S = 0.25  # by which the time of one source falls if the clock is put back; threads may be late by less
 

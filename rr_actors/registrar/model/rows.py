@@ -17,7 +17,15 @@ Int64 = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
 
 
 class State(enum.StrEnum):
-    """The state that a status gives a resource (thesis: status codes)."""
+    """The state that a status gives a resource (thesis: status codes).
+
+    Attributes:
+        OK: it can be used; also after a WARNING or an ERROR.
+        UPDATE: it can be used, and its response is another one.
+        WARNING: it can be used, but something is amiss.
+        ERROR: it does not work now.
+        FATAL: it is lost for good. The next load of its request gets a fresh one.
+    """
 
     OK = "OK"
     UPDATE = "UPDATE"

@@ -168,7 +168,13 @@ def update_child(tree: SupervisorState, id: str, spec: Supervisor) -> Supervisor
 
 
 class Counts(NamedTuple):
-    """Numbers of specifications (of living and dead children), of running children (`active`), and of each type."""
+    """How many children a supervisor has, as count_children() returns it.
+
+    Attributes:
+        specs: specifications, of living and dead children; under simple_one_for_one 1, the template.
+        active: children that run.
+        supervisors, workers: children of each type, living and dead.
+    """
 
     specs: int
     active: int
@@ -182,7 +188,7 @@ def which_children(tree: SupervisorState) -> list[SupervisedChild]:
 
 
 def count_children(tree: SupervisorState) -> Counts:
-    """Count the children. Under simple_one_for_one `specs` is 1, the template."""
+    """Count the children."""
     children = tree.children.values()
     supervisors = sum(child.spec.type == "supervisor" for child in children)
     active = sum(child.state == "running" for child in children)

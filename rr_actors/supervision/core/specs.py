@@ -417,6 +417,13 @@ def draw(seconds: Seconds, chance: Chance) -> float:
 class ChildModel(Struct, frozen=True):
     """How long a child needs to start, how long it lives, and how it ends. `Child.fails()` makes one, and says more.
 
+    Attributes:
+        every_s: from when it is ready to its end; None: it lives for ever.
+        start_s, stop_s: what a start and a stop take.
+        start_fails: the part of its starts that fail, from 0 to 1.
+        hangs: the part of its lives at whose end it hangs instead.
+        reason: how it ends: "killed", "abnormal" or "normal".
+
     Raises:
         InvalidSpec: `.field`, `.expected`, `.got`.
     """

@@ -124,7 +124,7 @@ class ConnectedQuery(Query[Response]):
 
     def _hold_again(self, held: Holding) -> None:
         """Note that the system's next run holds it."""
-        self._held_as, self.resource_id = held.query_id, held.resource_id
+        self._held_as, self._resource_id = held.query_id, held.resource_id
         self._lose(None)
 
     def _silence(self) -> RrError:

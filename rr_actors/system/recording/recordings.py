@@ -25,12 +25,12 @@ from rr_actors.base.names import time_in
 from rr_actors.base.reporting.log import Log
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.links.recorder import RECORDED, entries_of
-from rr_actors.registrar.model.recorded import DECIDED, Entry, in_order
+from rr_actors.registrar.model.recorded import DEAD_LETTER, DECIDED, Entry, in_order
 from rr_actors.registrar.pages import ResourceRow
 from rr_actors.registrar.queries import Query, ResourceInfo
 from rr_actors.system.recording.event_memory import Event
 from rr_actors.system.recording.figures import Counters
-from rr_actors.system.recording.traces import DEAD_LETTER, Trace, messages_of, trace_of
+from rr_actors.system.recording.traces import Trace, messages_of, trace_of
 
 logger = Log("rr_actors")
 

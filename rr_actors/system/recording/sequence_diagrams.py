@@ -5,26 +5,32 @@ from __future__ import annotations
 from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
 
+from rr_actors.actors.messaging.dead_letters import LOST_WITH
 from rr_actors.actors.messaging.message_notes import MESSAGES, REPLIES
 from rr_actors.base.errors import counted
-from rr_actors.registrar.model.recorded import Entry
+from rr_actors.registrar.model.recorded import DEAD_LETTER, Entry
 from rr_actors.system.recording.timings import ANSWERS
 
 _TEXT = 80  # characters of a label
 _CODES = {"#": "#35;", ";": "#59;", "<": "#lt;", ">": "#gt;", "%": "#37;", '"': "#quot;", "{": "#123;", "}": "#125;"}
 _MOST = 1000  # arrows; a browser draws no more
+_DEAD = " (did not arrive)"
+_UNKNOWN = " (no record of its arrival)"
 
 
 def sequence_of(entries: Sequence[Entry]) -> str:
     """Return a diagram of these entries, which are in the order of their time.
 
-    The arrow of a message that is not known to have arrived, as its receiver was killed, ends in a cross.
+    The arrow of a message that is not known to have arrived ends in a cross. If a dead letter proves that it did not,
+    its label says "(did not arrive)". If the receiver was killed, its last entries are lost: "(no record of its
+    arrival)".
     """
     names = _participants(entries)
     lines = ["sequenceDiagram"]
     lines += [f"    participant {alias} as {_text(name)}" for name, alias in names.items()]
     began = entries[0].at if entries else 0.0
     paired, lost = _arrivals(entries)
+    undelivered = _undelivered(entries, lost)
     since: dict[tuple[str, str, str], float] = {}
     drawn = 0
     for number, entry in enumerate(entries):
@@ -36,7 +42,8 @@ def sequence_of(entries: Sequence[Entry]) -> str:
                 ends = dict.fromkeys(("p0", f"p{len(names) - 1}"))
                 lines.append(f"    Note over {','.join(ends)}: {counted(len(entries) - number, 'more entry')}")
                 break
-            lines.append(_arrow(entry, names, lost=number in lost, at=at))
+            end = "" if number not in lost else _DEAD if number in undelivered else _UNKNOWN
+            lines.append(_arrow(entry, names, end, at))
         elif entry.event == "began":
             since[entry.server, entry.resource, entry.name] = entry.at
             what = f"{at}: {entry.name} {entry.server} begins"
@@ -63,12 +70,11 @@ def _participants(entries: Sequence[Entry]) -> dict[str, str]:
     return names
 
 
-def _arrow(entry: Entry, names: dict[str, str], *, lost: bool, at: str) -> str:
+def _arrow(entry: Entry, names: dict[str, str], end: str, at: str) -> str:
     me, other = names[entry.registrar], names[entry.peer]
     source, target = (me, other) if entry.event == "sent" else (other, me)
-    arrow = ("--" if entry.name in ANSWERS else "-") + ("x" if lost else ">>")
+    arrow = ("--" if entry.name in ANSWERS else "-") + ("x" if end else ">>")
     what = " ".join(text for text in (entry.name, entry.server, entry.detail) if text)
-    end = "" if not lost else " (did not arrive)" if entry.name in MESSAGES else " (no record of its arrival)"
     return f"    {source}{arrow}{target}: {_text(f'{at}: {what}')}{end}"
 
 
@@ -127,6 +133,28 @@ def _without_effect(entries: Sequence[Entry], lost: set[int]) -> Iterator[int]:
             if number in lost and not effects & shown:
                 yield number
             effects -= shown
+
+
+def _undelivered(entries: Sequence[Entry], lost: set[int]) -> set[int]:
+    """Return the lost messages between actors that a dead letter proves not to have arrived.
+
+    A letter has no id. It is of the newest message before it that has its text, or else that its own process has sent:
+    one process's messages to an actor arrive in their order. A letter of a message that was on its way to a process
+    that died proves nothing: it may be what the process died of.
+    """
+    found: set[int] = set()
+    waiting: dict[str, list[int]] = defaultdict(list)  # the lost messages to an actor, oldest first
+    for number, entry in enumerate(entries):
+        if number in lost and entry.name in MESSAGES:
+            waiting[entry.peer].append(number)
+        elif entry.event == DEAD_LETTER and not str(entry.facts.get("why", "")).startswith(LOST_WITH):
+            text, sent = entry.facts.get("message"), waiting[entry.registrar]
+            meant = [one for one in sent if entries[one].detail == text]
+            meant = meant or [one for one in sent if entries[one].pid == entry.pid]
+            if meant:
+                found.add(meant[-1])
+                sent.remove(meant[-1])
+    return found
 
 
 def _text(text: str) -> str:

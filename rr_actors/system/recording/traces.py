@@ -18,12 +18,10 @@ from rr_actors.base.checks import needing
 from rr_actors.base.errors import NotFound, UsageError, counted, did_you_mean, few, shown
 from rr_actors.base.names import named
 from rr_actors.base.notebook import bundle, table
-from rr_actors.registrar.model.recorded import Entry, in_order
+from rr_actors.registrar.model.recorded import DEAD_LETTER, Entry, in_order
 from rr_actors.system.recording.sequence_diagrams import sequence_of
 from rr_actors.system.recording.timings import ANSWERS, Timing, timings_of, trace_id_of
 
-DEAD_LETTER = "dead_letter"
-"""The event of a message that reached no actor. Its registrar is that actor."""
 BEGINNINGS = {"Load", "Unload", *MESSAGES}
 """The names of the messages with which a trace can begin."""
 _PREFIX = 4  # an id can be given by its first characters, at least so many

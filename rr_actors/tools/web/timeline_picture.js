@@ -217,7 +217,8 @@ export class TimelineView {
     this.lanes.setAttribute("width", width);
     this.lanes.setAttribute("height", height);
     this.lanes.innerHTML = `<rect class="back" width="100%" height="100%"/>${grid}${out.join("")}`;
-    const left = this.data.left_out ? `, ${this.data.left_out} lanes with less trouble are left out` : "";
+    const count = this.data.left_out;
+    const left = count ? `, left out: ${count} lane${count === 1 ? "" : "s"} with less trouble` : "";
     this.subject.textContent = this.data.subject + left;
     this.host.dataset.since = a;
     this.host.dataset.until = b;
