@@ -286,6 +286,19 @@ def test_a_real_kill_is_seen_in_a_recording_in_its_file_and_in_the_history(
     assert "loaded" in [mark.kind for lane in read_timeline(tmp_path / "run.jsonl").lanes for mark in lane.marks]
 
 
+def test_a_life_before_the_first_event_is_drawn_from_the_beginning_of_the_recording(tmp_path: Path) -> None:
+    began = time.time() - 60
+    file = tmp_path / "run.jsonl"
+    killed = {"at": began + 5, "event": "exited", "process": "root/a", "facts": {"reason": "killed", "up_s": 30.0}}
+    file.write_text(f"{json.dumps({'recording': 1, 'system': 's', 'at': began})}\n{json.dumps(killed)}\n")
+
+    timeline = read_timeline(file)
+
+    assert (timeline.since, timeline.until) == (began, began + 5)
+    ((bar,),) = [lane.bars for lane in timeline.lanes if lane.path == "root/a"]
+    assert (bar.begin, bar.end, bar.how) == (began - 25, began + 5, "killed")
+
+
 # -- files -----------------------------------------------------------------------------------------------------------
 
 HEADER = json.dumps({"recording": 1, "system": "s", "at": 1.0})

@@ -25,6 +25,7 @@ from rr_actors.tools.web.lab.lab_folder import read_experiment, read_lab
 from rr_actors.tools.web.lab.lab_notebook import notebook_of
 from rr_actors.tools.web.lab.lab_questions import QUESTIONS
 from rr_actors.tools.web.lab.playback import PACES, Playback
+from support import REPOSITORY
 from support_cli import run_cli
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -88,6 +89,11 @@ def test_the_levers_of_an_experiment_are_the_parameters_of_its_program(name: str
     assert {one.name: one.default for one in parameters} == {one.name: one.choices[0] for one in experiment.levers}
     assert experiment.question is not None
     assert experiment.code.startswith("from __future__ import annotations\n")
+
+
+def test_the_page_names_each_experiment_by_its_title() -> None:
+    rows = re.findall(r"^\| ([^|]+) \|", (REPOSITORY / "docs" / "console.md").read_text(), re.MULTILINE)
+    assert {experiment.title for experiment in EXPERIMENTS.values()} - set(rows) == set()
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)

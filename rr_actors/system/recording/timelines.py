@@ -185,15 +185,19 @@ def _as_of(lane: Lane, at: float) -> Lane:
     return msgspec.structs.replace(lane, bars=bars, marks=[mark for mark in lane.marks if mark.at <= at])
 
 
-def timeline_of(entries: Iterable[Entry], title: str = "", missed: int = 0) -> Timeline:
+def timeline_of(entries: Iterable[Entry], title: str = "", missed: int = 0, since: float | None = None) -> Timeline:
     """Return the timeline of a recording's entries, which are in the order of their time.
 
     It has a lane for each child that an entry names. A child of which nothing was recorded has none.
+
+    Args:
+        since: when the recording began, seconds since the epoch. Default: None, with its first entry.
     """
     building = Lanes()
     for entry in entries:
         building.take(entry)
-    return Timeline(building.lanes(), building.began or 0.0, building.latest, title, missed)
+    began = building.began or since or 0.0
+    return Timeline(building.lanes(), began if since is None else min(since, began), building.latest, title, missed)
 
 
 def read_timeline(path: str | os.PathLike[str]) -> Timeline:
@@ -205,7 +209,7 @@ def read_timeline(path: str | os.PathLike[str]) -> Timeline:
         ConfigError: it cannot be read, or is none of these; the error names the line.
     """
     found = read_events(path)
-    return timeline_of(found.entries(), found.system, found.missed)
+    return timeline_of(found.entries(), found.system, found.missed, None if found.is_history else found.since)
 
 
 # -- as SVG ------------------------------------------------------------------------------------------------------------
