@@ -231,7 +231,9 @@ def test_a_manager_does_not_wait_in_its_start_for_reloads_that_begin_after_it(
     child = system.ref("ends")
     watch = rr.monitor(child)
     child.tell("end")
-    assert watch.wait(LIMIT_S).reason != "normal"
+    down = watch.wait(LIMIT_S)
+    assert down is not None
+    assert down.reason != "normal"
     child.wait_running(LIMIT_S)
     assert app.load("ends/thing", "cup", timeout_s=LIMIT_S).resource_id == query.resource_id
 
