@@ -17,6 +17,8 @@ from typing import Any, Protocol
 
 import msgspec
 
+from rr_actors.base.errors import Unavailable
+
 
 class Hello(msgspec.Struct, frozen=True, array_like=True):
     """The first message of the side that opens a link: its purpose, the receiver, the sender and its incarnation."""
@@ -128,6 +130,10 @@ Attach = Callable[[Link], Receiver]
 Accept = Callable[[Hello], tuple[Welcome, Attach]]
 
 
+class NotAnswering(Unavailable):
+    """The peer's process has its socket, but did not finish the handshake in time: it is stopped, busy, or hangs."""
+
+
 class Transport(Protocol):
     """Opens and accepts links."""
 
@@ -145,7 +151,8 @@ class Transport(Protocol):
 
         Raises:
             RrError: the error that the other side's accept raised.
-            Unavailable: no transport listens at the address, or the handshake failed or took too long.
+            Unavailable: no transport listens at the address, or the handshake failed.
+            NotAnswering: the handshake took too long.
         """
         ...
 

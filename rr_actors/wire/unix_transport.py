@@ -22,7 +22,7 @@ from rr_actors.wire.frames import FRAME_LIMIT_BYTES, decoder_of
 from rr_actors.wire.handshake import AcceptorHandshake, DiallerHandshake, check_key
 from rr_actors.wire.segments import Segments
 from rr_actors.wire.thread_connections import BlockingLink
-from rr_actors.wire.transport import Accept, Attach, Hello, Link, Welcome
+from rr_actors.wire.transport import Accept, Attach, Hello, Link, NotAnswering, Welcome
 from rr_actors.wire.unix_link import CLOSE_LIMIT_S, UnixLink, Wire
 from rr_actors.wire.unix_sockets import Refusals, SocketDir, new_name, peer_of
 
@@ -115,7 +115,7 @@ class UnixTransport:
                 return await dialler.done
             except _TurnedAway as error:
                 if loop.time() + _RETRY_S >= deadline:
-                    raise Unavailable(f"{hello.to} closes each connection: too many others want one") from error
+                    raise NotAnswering(f"{hello.to} closes each connection: too many others want one") from error
                 await asyncio.sleep(_RETRY_S)
             except BaseException:  # cancelled, or the peer's refusal
                 dialler.abandon()
@@ -135,7 +135,7 @@ class UnixTransport:
                 return self._sockets.connect(address)
             except BlockingIOError as error:  # its backlog is full
                 if loop.time() >= deadline:
-                    raise Unavailable(f"{hello.to} does not accept connections at {address}") from error
+                    raise NotAnswering(f"{hello.to} does not accept connections at {address}") from error
                 await asyncio.sleep(_RETRY_S)
             except (OSError, ValueError) as error:
                 if wanted := wanted_by(error):  # this process lacks something: waiting for the peer would not help
@@ -371,11 +371,11 @@ class _Dialler(asyncio.Protocol):
             link.data_received(self._handshake.rest)
 
     def _time_out(self) -> None:
-        self._fail(f"it did not send {self._handshake.waits_for} within {HANDSHAKE_TIMEOUT_S:g} s")
+        self._fail(f"it did not send {self._handshake.waits_for} within {HANDSHAKE_TIMEOUT_S:g} s", NotAnswering)
 
-    def _fail(self, why: str) -> None:
+    def _fail(self, why: str, kind: type[Unavailable] = Unavailable) -> None:
         peer = self._peer.named(self.hello.to) if self._transport is not None else self.hello.to
-        self.fail(Unavailable(f"cannot open a link to {peer}: {why}"))
+        self.fail(kind(f"cannot open a link to {peer}: {why}"))
 
     def fail(self, error: Exception) -> None:
         """Close the connection, and make connect() raise `error`."""

@@ -45,6 +45,38 @@ def test_an_ask_says_so(system: rr.System) -> None:
         ref.ask("hello", block=False).get(timeout=0.3)
 
 
+def test_the_first_ask_of_a_process_that_is_stopped_waits_as_every_ask(
+    start: Callable[..., rr.System], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rr_actors.wire.unix_transport.HANDSHAKE_TIMEOUT_S", 0.1)
+    system = start(rr.ChildSpec(Asked, id="asked", heartbeat_s=None))
+    ref = system.ref("asked")
+    pid = pid_of(system, "asked")
+    hang(pid)
+    try:
+        with pytest.raises(pykka.Timeout, match=f"the reply of root/asked; it {STOPPED}"):
+            ref.ask("hello", timeout=0.5)
+        later = ref.ask("hello again", block=False)
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    assert later.get(timeout=LIMIT_S) == "hello again"
+
+
+def test_the_first_ask_of_a_process_that_is_stopped_hears_that_it_is_killed(
+    start: Callable[..., rr.System], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rr_actors.wire.unix_transport.HANDSHAKE_TIMEOUT_S", 0.1)
+    system = start(rr.ChildSpec(Asked, id="asked", heartbeat_s=None))
+    ref = system.ref("asked")
+    hang(pid_of(system, "asked"))
+    asked = ref.ask("hello", block=False)
+    with pytest.raises(pykka.Timeout):
+        asked.get(timeout=0.5)
+    ref.kill()
+    with pytest.raises(rr.Unavailable, match="root/asked is being started again"):
+        asked.get(timeout=LIMIT_S)
+
+
 def test_a_call_of_a_handle_says_so(system: rr.System, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rr_actors.registrar.remote_registrar.GRACE_S", 0.1)
     handle = system.registrar("asked")

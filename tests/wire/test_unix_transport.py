@@ -24,7 +24,7 @@ import pytest
 from rr_actors.base.errors import ConfigError, MailboxFull, NotSerializable, Unavailable, UsageError
 from rr_actors.wire import unix_link, unix_transport
 from rr_actors.wire.handshake import PROTOCOL, AcceptorHandshake, DiallerHandshake
-from rr_actors.wire.transport import Hello, Welcome
+from rr_actors.wire.transport import Hello, NotAnswering, Welcome
 from rr_actors.wire.unix_transport import STRANGERS_LIMIT, UnixTransport
 from support_transports import HELLO, KEY, LOOPS, Door, Inbox, Note, authenticated, frame, loop_of, stream
 
@@ -398,7 +398,7 @@ def test_connecting_to_one_that_does_not_answer_raises_unavailable_in_time(
             results = await asyncio.gather(
                 *(transport.connect("deaf", HELLO, Inbox().attach) for _ in range(connections)), return_exceptions=True
             )
-            assert [type(result) for result in results] == [Unavailable] * connections
+            assert [type(result) for result in results] == [NotAnswering] * connections
             assert all("cameras" in str(result) for result in results)
             assert time.monotonic() - started < 5
 

@@ -44,7 +44,7 @@ from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.runtime.time_limits import deadline_of
 from rr_actors.wire.segments import Lie
 from rr_actors.wire.thread_connections import BlockingLink, ThreadConnections
-from rr_actors.wire.transport import Hello, Link
+from rr_actors.wire.transport import Hello, Link, NotAnswering
 from rr_actors.wire.unix_sockets import pid_of
 from rr_actors.wire.unix_transport import UnixTransport
 
@@ -335,7 +335,8 @@ class Line:
 
     async def _connect(self) -> None:
         try:
-            await self._transport.connect(self.address, self._hello, self._attach)
+            while not await self._has_connected():
+                pass
         except RrError as error:
             self._fail(error)
         except asyncio.CancelledError:
@@ -344,6 +345,13 @@ class Line:
         finally:
             self._connecting = None
         self._pump()
+
+    async def _has_connected(self) -> bool:
+        try:
+            await self._transport.connect(self.address, self._hello, self._attach)
+        except NotAnswering:  # it may go on: each call has a time limit of its own, as it has over an open link
+            return False
+        return True
 
     def _fail(self, reason: Exception | None) -> None:
         self._forget(self)
