@@ -84,6 +84,20 @@ def test_a_call_of_a_handle_says_so(system: rr.System, monkeypatch: pytest.Monke
         handle.load("asked/thing", "x", timeout_s=0.3)
 
 
+def test_the_first_call_of_a_handle_says_so(start: Callable[..., rr.System], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rr_actors.wire.unix_transport.HANDSHAKE_TIMEOUT_S", 0.1)
+    monkeypatch.setattr("rr_actors.registrar.remote_registrar.GRACE_S", 0.1)
+    monkeypatch.setattr("rr_actors.registrar.links.remote_calls.GRACE_S", 0.1)
+    system = start(rr.ChildSpec(Asked, id="asked", heartbeat_s=None))
+    pid = pid_of(system, "asked")
+    hang(pid)
+    try:
+        with pytest.raises(rr.Unavailable, match=rf"registrar 'asked': its process does not answer; it {STOPPED}"):
+            system.registrar("asked").load("asked/thing", "x", timeout_s=0.3)
+    finally:
+        os.kill(pid, signal.SIGCONT)
+
+
 def test_what_is_awaited_of_a_handle_says_so(start: Callable[..., rr.System], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rr_actors.registrar.remote_registrar.GRACE_S", 0.1)
     monkeypatch.setattr("rr_actors.registrar.links.remote_calls.GRACE_S", 0.1)

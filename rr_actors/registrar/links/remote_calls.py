@@ -25,7 +25,7 @@ from rr_actors.base.values.failure import Failure, error_of, failure_of
 from rr_actors.runtime.callback_errors import Raised, described
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.wire.name_service import Directory, Presence, registrar_key
-from rr_actors.wire.transport import Hello, Link, Transport
+from rr_actors.wire.transport import Hello, Link, NotAnswering, Transport
 from rr_actors.wire.unix_sockets import paused
 
 logger = Log("rr_actors")
@@ -283,6 +283,9 @@ class HandleLine:
                 hello = Hello(KIND, self._registrar, self._node.path, 0)
                 try:
                     self._link = await self._node.transport.connect(address, hello, self._attach)
+                except NotAnswering as error:
+                    text = f"registrar {self._registrar!r}: its process does not answer{self.paused()}"
+                    raise _Coming(Unavailable(text)) from error
                 except (Unavailable, UnknownRegistrar) as error:  # its process has just died, or does not serve it yet
                     raise _Coming(error) from error
             assert self._link is not None
