@@ -335,8 +335,11 @@ class Line:
 
     async def _connect(self) -> None:
         try:
-            while not await self._has_connected():
-                pass
+            connected = False
+            while not connected:  # a process that does not answer may go on: each call has a time limit of its own
+                with contextlib.suppress(NotAnswering):
+                    await self._transport.connect(self.address, self._hello, self._attach)
+                    connected = True
         except RrError as error:
             self._fail(error)
         except asyncio.CancelledError:
@@ -345,13 +348,6 @@ class Line:
         finally:
             self._connecting = None
         self._pump()
-
-    async def _has_connected(self) -> bool:
-        try:
-            await self._transport.connect(self.address, self._hello, self._attach)
-        except NotAnswering:  # it may go on: each call has a time limit of its own, as it has over an open link
-            return False
-        return True
 
     def _fail(self, reason: Exception | None) -> None:
         self._forget(self)
